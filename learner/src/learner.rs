@@ -113,7 +113,7 @@ impl Learner {
         let policy = Policy::new(&config, spec)?;
         let (workers, envs) = (config.places(), config.actors.envs_per_worker);
         let layout = policy.layout();
-        let regime = Regime::new(&config, &policy)?;
+        let regime = Regime::new(&config, &policy, spec.goal_rule.as_deref())?;
         let random = seeds::stream(config.run.seed, "replay", 0);
         let hindsight = GoalSampler::from_config(spec.goal_rule.as_deref(), &config);
         let replay_steps = regime.replay_steps(&config, layout.segment_steps);

@@ -3,6 +3,7 @@
 //! beside these updates. Called by [`crate::learner`].
 
 use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::goal_rule::GoalRule;
 use dmprl_shared::policy::{Head, Policy};
 
 use crate::algorithms::cloning::Cloning;
@@ -43,12 +44,17 @@ pub struct CloningLosses {
 }
 
 impl OffPolicy {
-    /// Makes the configured algorithm with newly drawn networks.
+    /// Makes the configured algorithm with newly drawn networks. `rule` is the environment's rule
+    /// for goals, if it has one.
     ///
     /// # Errors
     /// If the processor or the device does not support the configuration.
-    pub fn new(config: &ExperimentConfig, policy: &Policy) -> candle_core::Result<Self> {
-        let algorithm = Algorithm::new(config, policy)?;
+    pub fn new(
+        config: &ExperimentConfig,
+        policy: &Policy,
+        rule: Option<&GoalRule>,
+    ) -> candle_core::Result<Self> {
+        let algorithm = Algorithm::new(config, policy, rule)?;
         Ok(Self {
             pacing: Pacing::new(&config.pacing),
             batch: Batch::new(algorithm.batch_shape()),

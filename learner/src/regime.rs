@@ -3,6 +3,7 @@
 
 use candle_core::Result;
 use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
+use dmprl_shared::goal_rule::GoalRule;
 use dmprl_shared::policy::Policy;
 
 use crate::algorithms::ndp::Ndp;
@@ -21,14 +22,19 @@ pub enum Regime {
 }
 
 impl Regime {
-    /// Makes the configured algorithm with newly drawn networks.
+    /// Makes the configured algorithm with newly drawn networks. `rule` is the environment's rule
+    /// for goals, if it has one.
     ///
     /// # Errors
     /// If the processor or the device does not support the configuration.
-    pub fn new(config: &ExperimentConfig, policy: &Policy) -> Result<Self> {
+    pub fn new(
+        config: &ExperimentConfig,
+        policy: &Policy,
+        rule: Option<&GoalRule>,
+    ) -> Result<Self> {
         Ok(match config.algorithm.name {
             AlgorithmName::Ndp => Self::OnPolicy(Box::new(Ndp::new(config, policy)?)),
-            _ => Self::OffPolicy(Box::new(OffPolicy::new(config, policy)?)),
+            _ => Self::OffPolicy(Box::new(OffPolicy::new(config, policy, rule)?)),
         })
     }
 

@@ -71,7 +71,7 @@ fn allocations(case: Case, precision: &str, threads: &str) -> u64 {
     let config = layers.finish().unwrap();
     let spec = spec();
     let policy = Policy::new(&config, &spec).unwrap();
-    let mut algorithm = Algorithm::new(&config, &policy).unwrap();
+    let mut algorithm = Algorithm::new(&config, &policy, spec.goal_rule.as_deref()).unwrap();
     let batch = Batch::new(algorithm.batch_shape());
     let mut update = |count| {
         algorithm.update(&policy, &batch, count).unwrap();

@@ -1,11 +1,13 @@
 //! A batch of windows, sampled directly into the buffers that the update reads.
 
 use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, CriticInput, Target};
+use dmprl_shared::goal_rule::GoalRule;
 use dmprl_shared::policy::Policy;
 use rand::RngExt;
 use rand_distr::StandardNormal;
 use thiserror::Error;
 
+use super::outcome_shape::OutcomeShape;
 use super::sample::{Sample, target_range};
 use crate::normaliser::Normaliser;
 use crate::replay::{Goal, GoalSampler, Replay, Sampler};
@@ -24,7 +26,7 @@ pub struct NoWindow {
 }
 
 /// Sizes of a batch and of the critic's input.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BatchShape {
     /// Rows of the batch, B.
     pub rows: usize,
@@ -42,12 +44,14 @@ pub struct BatchShape {
     pub next_noise: bool,
     /// Whether the actor's step needs noise (SAC).
     pub noise: bool,
+    /// Shape of the outcome model, if the critics see one.
+    pub outcome: Option<OutcomeShape>,
 }
 
 impl BatchShape {
-    /// Derives the sizes from algorithm and policy.
+    /// Derives the sizes from algorithm, policy and the environment's rule for goals.
     #[must_use]
-    pub fn new(config: &AlgorithmConfig, policy: &Policy) -> Self {
+    pub fn new(config: &AlgorithmConfig, policy: &Policy, rule: Option<&GoalRule>) -> Self {
         let layout = policy.layout();
         let segment_actions_len = layout.segment_steps * layout.action_len;
         let carried = if policy.carries_state() { 2 * layout.action_len } else { 0 };
@@ -62,13 +66,22 @@ impl BatchShape {
             action_len: layout.action_len,
             next_noise: matches!(config.name, AlgorithmName::Td3 | AlgorithmName::Sac),
             noise: config.name == AlgorithmName::Sac,
+            outcome: rule
+                .filter(|_| config.outcome_model && whole)
+                .and_then(|rule| OutcomeShape::new(rule, layout.segment_steps)),
         }
     }
 
-    /// Returns the width of the critic's input: observation, actions, end state.
+    /// Returns the width of a batch's critic inputs: observation, actions, end state.
     #[must_use]
     pub fn critic_inputs(&self) -> usize {
         self.observation_len + self.actions_len + self.end_state_len
+    }
+
+    /// Returns the width of the critic's input: a batch's, then the outcome model's features.
+    #[must_use]
+    pub fn critic_width(&self) -> usize {
+        self.critic_inputs() + self.outcome.map_or(0, OutcomeShape::features_len)
     }
 }
 
@@ -97,6 +110,8 @@ pub struct Batch {
     pub previous_actions: Vec<f32>,
     /// 1 if u_{t-1} exists, 0 if the episode began or the replay no longer has it, (B,).
     pub has_previous: Vec<f32>,
+    /// How each step of the window moves the achieved goal, for the outcome model, (B, K G).
+    pub motion: Vec<f32>,
     /// Smallest and largest target that the rewards allow; infinite if unknown.
     pub target_range: [f32; 2],
     actions: Vec<f32>,
@@ -162,6 +177,7 @@ impl Batch {
             noise: noise(shape.noise),
             previous_actions: vec![0.0; shape.rows * shape.action_len],
             has_previous: vec![0.0; shape.rows],
+            motion: vec![0.0; shape.rows * shape.outcome.map_or(0, OutcomeShape::outputs)],
             target_range: [f32::NEG_INFINITY, f32::INFINITY],
             actions: vec![0.0; shape.segment_actions_len],
         }
@@ -256,6 +272,10 @@ impl Batch {
                 hindsight.discounted_bonus(replay, window, steps, rewards_discount);
         }
         self.bootstrap[row] = if outcome.terminated { 0.0 } else { factor };
+        if let Some(shape) = shape.outcome {
+            let own = row * shape.outputs()..(row + 1) * shape.outputs();
+            shape.write_motion(replay, window, *outcome, &mut self.motion[own]);
+        }
     }
 
     /// Writes the actions of a row, and the action before them.
@@ -302,6 +322,7 @@ mod tests {
         action_len: 1,
         next_noise: false,
         noise: false,
+        outcome: None,
     };
 
     /// Inserts an episode e of three steps: s_t = 10 e + t, u_t = (t + 1) / 10, r_t = 1, 10, 100.

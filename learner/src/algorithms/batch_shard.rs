@@ -5,11 +5,13 @@ use std::ops::Range;
 use dmprl_shared::policy::{Activations, Head, HeadGradient, MlpShape, Policy, PolicyWorkspace};
 
 use super::batch::States;
+use super::outcome::OutcomeBuffers;
 use super::{Batch, BatchShape};
 use crate::update::SHARD_ROWS;
 use crate::update::backward_pass::Gradients;
 use crate::update::layer_norm::Normalised;
 use crate::update::network::{NetworkView, PassRecord, TrainableNetwork};
+use crate::update::thread_pool::ThreadPool;
 
 /// A critic's buffers for one shard.
 #[derive(Debug)]
@@ -70,13 +72,17 @@ pub struct BatchShard {
     pub policy: PolicyWorkspace,
     actor_gradients: Gradients,
     critics: Vec<CriticBuffers>,
-    /// Critic inputs with the policy's own actions, (rows, critic inputs).
+    /// Critic inputs with the policy's own actions, (rows, critic width).
     critic_inputs: Vec<f32>,
+    outcome: Option<OutcomeBuffers>,
+    /// Critic inputs with the batch's actions and the outcome model's features, (rows, critic
+    /// width), or empty without a model.
+    batch_inputs: Vec<f32>,
     /// Targets of the critics, (rows,).
     pub targets: Vec<f32>,
     /// log pi of the actions that the policy drew, (rows,).
     pub log_densities: Vec<f32>,
-    /// Gradient of one critic with respect to actions and end state, (rows, actions + end state).
+    /// Gradient of one critic with respect to its inputs after the observation.
     input_gradient: Vec<f32>,
     /// Gradient with respect to u, later to the means before tanh, (rows, K A), from all critics.
     pub actions_gradient: Vec<f32>,
@@ -86,9 +92,15 @@ pub struct BatchShard {
     pub sums: LossSums,
 }
 
-/// Cuts a batch into shards, with buffers for critics of one shape.
+/// Cuts a batch into shards, with buffers for critics of one shape, and the outcome model that they
+/// see.
 #[must_use]
-pub fn shards(policy: &Policy, shape: BatchShape, critics: &[TrainableNetwork]) -> Vec<BatchShard> {
+pub fn shards(
+    policy: &Policy,
+    shape: BatchShape,
+    critics: &[TrainableNetwork],
+    outcome_model: Option<&TrainableNetwork>,
+) -> Vec<BatchShard> {
     let shard = |first: usize| {
         let rows = first..(first + SHARD_ROWS).min(shape.rows);
         let count = rows.len();
@@ -101,10 +113,15 @@ pub fn shards(policy: &Policy, shape: BatchShape, critics: &[TrainableNetwork]) 
             policy: policy.workspace(count),
             actor_gradients: Gradients::new(policy.shape(), count),
             critics: critics.iter().map(|critic| CriticBuffers::new(critic, count)).collect(),
-            critic_inputs: vec![0.0; count * shape.critic_inputs()],
+            critic_inputs: vec![0.0; count * shape.critic_width()],
+            outcome: outcome_model.and_then(|model| OutcomeBuffers::new(shape, model, count)),
+            batch_inputs: match outcome_model {
+                Some(_) => vec![0.0; count * shape.critic_width()],
+                None => Vec::new(),
+            },
             targets: vec![0.0; count],
             log_densities: vec![0.0; count],
-            input_gradient: vec![0.0; count * (shape.actions_len + shape.end_state_len)],
+            input_gradient: vec![0.0; count * (shape.critic_width() - shape.observation_len)],
             actions_gradient: vec![0.0; count * shape.segment_actions_len],
             end_gradient: vec![0.0; count * shape.end_state_len],
             sums: LossSums::default(),
@@ -117,8 +134,15 @@ impl BatchShard {
     /// Returns this shard's part of one of the batch's buffers.
     #[must_use]
     pub fn part<'a>(&self, buffer: &'a [f32]) -> &'a [f32] {
-        let width = buffer.len() / self.shape.rows;
-        &buffer[self.rows.start * width..self.rows.end * width]
+        part(&self.rows, self.shape.rows, buffer)
+    }
+
+    /// Returns the critic inputs with the batch's own actions.
+    fn batch_inputs<'a>(&'a self, batch: &'a Batch) -> &'a [f32] {
+        match self.outcome {
+            Some(_) => &self.batch_inputs,
+            None => self.part(&batch.critic_inputs),
+        }
     }
 
     fn rows_len(&self) -> usize {
@@ -137,14 +161,44 @@ impl BatchShard {
         policy.decode(self.part(states.observations), &mut self.policy);
     }
 
-    /// Computes Q(states, u) of the policy's own actions with each critic.
+    /// Predicts the outcomes of the batch's own actions, for [`BatchShard::critic_backward`], and
+    /// runs the model's backward pass.
+    pub fn outcome_backward(&mut self, model: &NetworkView<'_>, batch: &Batch) {
+        let Some(outcome) = &mut self.outcome else { return };
+        let part = |buffer| part(&self.rows, self.shape.rows, buffer);
+        let (narrow, width) = (self.shape.critic_inputs(), self.shape.critic_width());
+        let rows = part(&batch.critic_inputs).chunks_exact(narrow);
+        for (row, out) in rows.zip(self.batch_inputs.chunks_exact_mut(width)) {
+            out[..narrow].copy_from_slice(row);
+        }
+        outcome.predict(model, part(&batch.observations), &mut self.batch_inputs, width);
+        outcome.loss_backward(model, part(&batch.motion), self.batch_rows);
+    }
+
+    /// Returns the record for the outcome model. Call it after [`BatchShard::outcome_backward`].
+    ///
+    /// # Panics
+    /// Without a model.
+    #[must_use]
+    pub fn outcome_record(&self) -> PassRecord<'_> {
+        self.outcome.as_ref().expect("an outcome model").record()
+    }
+
+    /// Computes Q(states, u) of the policy's own actions with each critic. They see the features of
+    /// the outcome model, if there is one.
     pub fn evaluate_critics(
         &mut self,
         policy: &Policy,
         critics: &[NetworkView<'_>],
+        outcome_model: Option<&NetworkView<'_>>,
         states: States<'_>,
     ) {
         self.assemble_critic_inputs(policy, self.part(states.inputs));
+        if let (Some(outcome), Some(model)) = (&mut self.outcome, outcome_model) {
+            let observations = part(&self.rows, self.shape.rows, states.observations);
+            let width = self.shape.critic_width();
+            outcome.predict(model, observations, &mut self.critic_inputs, width);
+        }
         for (critic, buffers) in critics.iter().zip(&mut self.critics) {
             let CriticBuffers { activations, normalised, .. } = buffers;
             critic.forward(&self.critic_inputs, activations, normalised.as_mut());
@@ -170,8 +224,11 @@ impl BatchShard {
     /// Runs the forward and backward passes of each critic's loss mean (Q - target)², on the
     /// batch's own actions.
     pub fn critic_backward(&mut self, critics: &[NetworkView<'_>], batch: &Batch) {
-        let inputs = self.part(&batch.critic_inputs);
         let rows = self.rows_len();
+        let inputs = match self.outcome {
+            Some(_) => &self.batch_inputs,
+            None => part(&self.rows, self.shape.rows, &batch.critic_inputs),
+        };
         self.sums = LossSums::default();
         for (index, (critic, buffers)) in critics.iter().zip(&mut self.critics).enumerate() {
             let CriticBuffers { activations, normalised, gradients } = buffers;
@@ -197,6 +254,7 @@ impl BatchShard {
     pub fn actions_gradient(
         &mut self,
         critics: &[NetworkView<'_>],
+        outcome_model: Option<&NetworkView<'_>>,
         weight: impl Fn(&Self, usize, usize) -> f32,
     ) {
         self.actions_gradient.fill(0.0);
@@ -214,6 +272,11 @@ impl BatchShard {
             pass.input_gradient(gradients, first, &mut self.input_gradient);
             self.add_input_gradient();
         }
+        if let (Some(outcome), Some(model)) = (&mut self.outcome, outcome_model) {
+            let through = outcome.actions_gradient(model);
+            let sums = self.actions_gradient.iter_mut().zip(through);
+            sums.for_each(|(sum, gradient)| *sum += gradient);
+        }
     }
 
     /// Runs the backward passes of the loss -mean Q of one critic, plus the penalty on action
@@ -223,11 +286,12 @@ impl BatchShard {
         policy: &Policy,
         actor: &NetworkView<'_>,
         critic: &[NetworkView<'_>; 1],
+        outcome_model: Option<&NetworkView<'_>>,
         rate: ActionRate<'_>,
     ) {
         self.sums = LossSums { actor: -self.q(0).iter().sum::<f32>(), ..LossSums::default() };
         let weight = -1.0 / self.batch_rows;
-        self.actions_gradient(critic, |_, _, _| weight);
+        self.actions_gradient(critic, outcome_model, |_, _, _| weight);
         self.unsquash();
         self.penalise(policy, rate);
         self.log_stds_backward(policy, |_, _, _| 0.0);
@@ -260,13 +324,16 @@ impl BatchShard {
 
     fn add_input_gradient(&mut self) {
         let BatchShape { actions_len, end_state_len, segment_actions_len, .. } = self.shape;
-        let width = actions_len + end_state_len;
+        let width = self.shape.critic_width() - self.shape.observation_len;
         for (row, input) in self.input_gradient.chunks_exact(width).enumerate() {
             // Actions that the critic does not see have a gradient of zero.
             let actions = &mut self.actions_gradient[row * segment_actions_len..][..actions_len];
             actions.iter_mut().zip(input).for_each(|(sum, gradient)| *sum += gradient);
             let end = &mut self.end_gradient[row * end_state_len..][..end_state_len];
             end.iter_mut().zip(&input[actions_len..]).for_each(|(sum, gradient)| *sum += gradient);
+            if let Some(outcome) = &mut self.outcome {
+                outcome.add_features_gradient(row, &input[actions_len + end_state_len..]);
+            }
         }
     }
 
@@ -353,7 +420,7 @@ impl BatchShard {
     #[must_use]
     pub fn critic_record<'a>(&'a self, index: usize, batch: &'a Batch) -> PassRecord<'a> {
         let CriticBuffers { activations, normalised, gradients } = &self.critics[index];
-        let inputs = self.part(&batch.critic_inputs);
+        let inputs = self.batch_inputs(batch);
         PassRecord { inputs, activations, normalised: normalised.as_ref(), gradients }
     }
 
@@ -377,7 +444,7 @@ impl BatchShard {
     /// Builds the critic inputs from the network inputs of the states and the policy's actions.
     fn assemble_critic_inputs(&mut self, policy: &Policy, inputs: &[f32]) {
         let BatchShape { observation_len, actions_len, segment_actions_len, .. } = self.shape;
-        let width = self.shape.critic_inputs();
+        let width = self.shape.critic_width();
         for (row, input) in self.critic_inputs.chunks_exact_mut(width).enumerate() {
             let state = &inputs[row * observation_len..(row + 1) * observation_len];
             let actions = &self.policy.actions[row * segment_actions_len..];
@@ -392,6 +459,27 @@ impl BatchShard {
             head.end_states(dmp, &mut self.critic_inputs[from..], width);
         }
     }
+}
+
+/// Returns the part of a buffer of `batch_rows` rows that belongs to some of them.
+fn part<'a>(rows: &Range<usize>, batch_rows: usize, buffer: &'a [f32]) -> &'a [f32] {
+    let width = buffer.len() / batch_rows;
+    &buffer[rows.start * width..rows.end * width]
+}
+
+/// Does an optimiser step of the outcome model, if there is one, on the batch's own actions. Call
+/// it before the critics' step, which uses the predictions.
+pub fn outcome_step(
+    model: &mut Option<TrainableNetwork>,
+    shards: &mut [BatchShard],
+    batch: &Batch,
+    pool: &mut ThreadPool,
+) {
+    let Some(model) = model else { return };
+    let view = model.view();
+    pool.for_each(shards, |shard| shard.outcome_backward(&view, batch));
+    drop(view);
+    model.adam_step(pool, shards, BatchShard::outcome_record, None);
 }
 
 /// Adds the sums of all shards, in their order.

@@ -46,7 +46,7 @@ impl Cloning {
     /// # Errors
     /// If the processor does not support the configured precision.
     pub fn new(config: &ExperimentConfig, policy: &Policy) -> Result<Self> {
-        let shape = BatchShape::new(&config.algorithm, policy);
+        let shape = BatchShape::new(&config.algorithm, policy, None);
         let (step_size, precision) =
             (config.algorithm.actor_learning_rate, config.learner.precision);
         let parameters = vec![0.0; policy.shape().parameters_len()];
@@ -54,7 +54,7 @@ impl Cloning {
         Ok(Self {
             actor: TrainableNetwork::new(layers, parameters.clone(), step_size, false, precision)?,
             parameters,
-            shards: shards(policy, shape, &[]),
+            shards: shards(policy, shape, &[], None),
             shape,
             observations: vec![0.0; shape.rows * shape.observation_len],
             inputs: vec![0.0; shape.rows * shape.observation_len],

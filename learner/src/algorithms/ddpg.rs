@@ -30,7 +30,8 @@ use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::Policy;
 
-use super::batch_shard::{ActionRate, BatchShard, shards, total};
+use super::batch_shard::{ActionRate, BatchShard, outcome_step, shards, total};
+use super::outcome::new_outcome_model;
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::network::TrainableNetwork;
 use crate::update::thread_pool::ThreadPool;
@@ -42,6 +43,8 @@ pub struct Ddpg {
     pub actor: TrainableNetwork,
     /// The critic Q and its target Q'.
     pub critic: TrainableNetwork,
+    /// Predicts the outcomes that the critics see, if configured.
+    pub outcome_model: Option<TrainableNetwork>,
     polyak: f32,
     action_rate_penalty: f32,
     pub(super) shards: Vec<BatchShard>,
@@ -56,9 +59,11 @@ impl Ddpg {
         let actor = new_actor(config, policy, true)?;
         let critic = new_critic(config, shape, "critic parameters")?;
         let polyak = config.algorithm.polyak as f32;
-        let shards = shards(policy, shape, std::slice::from_ref(&critic));
+        let outcome_model = new_outcome_model(config, shape)?;
+        let critics = std::slice::from_ref(&critic);
+        let shards = shards(policy, shape, critics, outcome_model.as_ref());
         let action_rate_penalty = config.algorithm.action_rate_penalty as f32;
-        Ok(Self { shards, actor, critic, polyak, action_rate_penalty })
+        Ok(Self { shards, actor, critic, outcome_model, polyak, action_rate_penalty })
     }
 
     /// Updates critic, actor and both targets.
@@ -71,6 +76,7 @@ impl Ddpg {
         batch: &Batch,
         pool: &mut ThreadPool,
     ) -> Result<Losses> {
+        outcome_step(&mut self.outcome_model, &mut self.shards, batch, pool);
         self.critic_step(policy, batch, pool)?;
         let critic = total(&self.shards);
         let rows = batch.rewards.len() as f32;
@@ -90,9 +96,11 @@ impl Ddpg {
         let (actor_target, critic_target) = (self.actor.target_view()?, self.critic.target_view()?);
         let critic = self.critic.view();
         let (critic_target, critic) = ([critic_target], [critic]);
+        let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
+        let model = model.as_ref();
         pool.for_each(&mut self.shards, |shard| {
             shard.act(policy, &actor_target, batch.next_states());
-            shard.evaluate_critics(policy, &critic_target, batch.next_states());
+            shard.evaluate_critics(policy, &critic_target, model, batch.next_states());
             shard.set_targets(batch, |shard, row| shard.q(0)[row]);
             shard.critic_backward(&critic, batch);
         });
@@ -109,13 +117,16 @@ impl Ddpg {
     /// Does an actor step on the loss -mean Q(s, pi(s)), plus the penalty on action changes.
     fn actor_step(&mut self, policy: &Policy, batch: &Batch, pool: &mut ThreadPool, penalty: f32) {
         let (actor, critic) = (self.actor.view(), [self.critic.view()]);
+        let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
+        let model = model.as_ref();
         pool.for_each(&mut self.shards, |shard| {
             shard.act(policy, &actor, batch.states());
-            shard.evaluate_critics(policy, &critic, batch.states());
+            shard.evaluate_critics(policy, &critic, model, batch.states());
             shard.deterministic_policy_gradient(
                 policy,
                 &actor,
                 &critic,
+                model,
                 ActionRate { penalty, batch },
             );
         });

@@ -121,7 +121,7 @@ impl Golden {
     fn check(mut self) {
         let config = self.config();
         let policy = Policy::new(&config, &spec()).unwrap();
-        let mut algorithm = Algorithm::new(&config, &policy).unwrap();
+        let mut algorithm = Algorithm::new(&config, &policy, None).unwrap();
         let shape = algorithm.batch_shape();
         let mut batch = Batch::new(shape);
         self.start(&mut algorithm);

@@ -22,6 +22,7 @@ const SHAPE: BatchShape = BatchShape {
     action_len: 1,
     next_noise: false,
     noise: false,
+    outcome: None,
 };
 
 fn rule(ends_within: Option<f64>) -> GoalRule {

@@ -10,6 +10,8 @@ pub mod ddpg;
 pub(crate) mod losses;
 mod minibatch_shard;
 pub mod ndp;
+mod outcome;
+mod outcome_shape;
 mod ppo;
 pub mod sac;
 mod sample;
@@ -17,6 +19,7 @@ pub mod td3;
 
 use candle_core::{Device, Result};
 use dmprl_shared::config::{self, AlgorithmName, ExperimentConfig};
+use dmprl_shared::goal_rule::GoalRule;
 use dmprl_shared::policy::{MlpShape, Policy, initial_parameters};
 use dmprl_shared::seeds;
 
@@ -64,13 +67,18 @@ enum Kind {
 }
 
 impl Algorithm {
-    /// Makes the configured algorithm with newly drawn networks.
+    /// Makes the configured algorithm with newly drawn networks. `rule` is the environment's rule
+    /// for goals, if it has one.
     ///
     /// # Errors
     /// If the processor or the device does not support the configuration, or the algorithm does not
     /// learn from a replay.
-    pub fn new(config: &ExperimentConfig, policy: &Policy) -> Result<Self> {
-        let shape = BatchShape::new(&config.algorithm, policy);
+    pub fn new(
+        config: &ExperimentConfig,
+        policy: &Policy,
+        rule: Option<&GoalRule>,
+    ) -> Result<Self> {
+        let shape = BatchShape::new(&config.algorithm, policy, rule);
         let kind = match config.algorithm.name {
             AlgorithmName::Ddpg => Kind::Ddpg(Box::new(Ddpg::new(config, policy, shape)?)),
             AlgorithmName::Td3 => Kind::Td3(Box::new(Td3::new(config, policy, shape)?)),
@@ -212,38 +220,48 @@ impl Kind {
         &mut self,
         mut f: impl FnMut(&'static str, &mut TrainableNetwork) -> std::result::Result<(), E>,
     ) -> std::result::Result<(), E> {
-        match self {
+        let outcome_model = match self {
             Self::Ddpg(ddpg) => {
                 f("actor", &mut ddpg.actor)?;
-                f("critic", &mut ddpg.critic)
+                f("critic", &mut ddpg.critic)?;
+                &mut ddpg.outcome_model
             }
             Self::Td3(td3) => {
                 f("actor", &mut td3.actor)?;
                 f("critic_1", &mut td3.critics[0])?;
-                f("critic_2", &mut td3.critics[1])
+                f("critic_2", &mut td3.critics[1])?;
+                &mut td3.outcome_model
             }
             Self::Sac(sac) => {
                 f("actor", &mut sac.actor)?;
                 f("critic_1", &mut sac.critics[0])?;
                 f("critic_2", &mut sac.critics[1])?;
-                f("log_temperature", &mut sac.log_temperature)
+                f("log_temperature", &mut sac.log_temperature)?;
+                &mut sac.outcome_model
             }
-        }
+        };
+        outcome_model.as_mut().map_or(Ok(()), |model| f("outcome_model", model))
     }
 
     fn networks(&self) -> Vec<(&'static str, &TrainableNetwork)> {
-        match self {
-            Self::Ddpg(ddpg) => vec![("actor", &ddpg.actor), ("critic", &ddpg.critic)],
+        let (mut networks, outcome_model) = match self {
+            Self::Ddpg(ddpg) => {
+                (vec![("actor", &ddpg.actor), ("critic", &ddpg.critic)], &ddpg.outcome_model)
+            }
             Self::Td3(td3) => {
                 let [first, second] = &td3.critics;
-                vec![("actor", &td3.actor), ("critic_1", first), ("critic_2", second)]
+                let networks = [("actor", &td3.actor), ("critic_1", first), ("critic_2", second)];
+                (networks.to_vec(), &td3.outcome_model)
             }
             Self::Sac(sac) => {
                 let [first, second] = &sac.critics;
                 let temperature = ("log_temperature", &sac.log_temperature);
-                vec![("actor", &sac.actor), ("critic_1", first), ("critic_2", second), temperature]
+                let networks = [("actor", &sac.actor), ("critic_1", first), ("critic_2", second)];
+                ([networks.as_slice(), &[temperature]].concat(), &sac.outcome_model)
             }
-        }
+        };
+        networks.extend(outcome_model.as_ref().map(|model| ("outcome_model", model)));
+        networks
     }
 }
 
@@ -261,7 +279,7 @@ fn new_critic(
     shape: BatchShape,
     name: &str,
 ) -> Result<TrainableNetwork> {
-    let mut widths = vec![shape.critic_inputs()];
+    let mut widths = vec![shape.critic_width()];
     widths.extend(&config.algorithm.critic_hidden);
     widths.push(1);
     let layers = MlpShape::new(widths);

@@ -26,7 +26,8 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::{Policy, gaussian};
 
 use super::batch::States;
-use super::batch_shard::{ActionRate, BatchShard, LossSums, shards, total};
+use super::batch_shard::{ActionRate, BatchShard, LossSums, outcome_step, shards, total};
+use super::outcome::new_outcome_model;
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::network::{NetworkView, TrainableNetwork};
 use crate::update::thread_pool::ThreadPool;
@@ -40,6 +41,8 @@ pub struct Sac {
     pub critics: [TrainableNetwork; 2],
     /// Logarithm of the temperature, a single number.
     pub log_temperature: TrainableNetwork,
+    /// Predicts the outcomes that the critics see, if configured.
+    pub outcome_model: Option<TrainableNetwork>,
     target_entropy: f32,
     polyak: f32,
     action_rate_penalty: f32,
@@ -65,12 +68,14 @@ impl Sac {
             new_critic(config, shape, "critic parameters")?,
             new_critic(config, shape, "second critic parameters")?,
         ];
+        let outcome_model = new_outcome_model(config, shape)?;
         let sac = &config.algorithm.sac;
         let log_temperature = sac.initial_temperature.ln() as f32;
         let rate = sac.temperature_learning_rate;
         Ok(Self {
             actor: new_actor(config, policy, false)?,
-            shards: shards(policy, shape, &critics),
+            shards: shards(policy, shape, &critics, outcome_model.as_ref()),
+            outcome_model,
             critics,
             log_temperature: TrainableNetwork::scalar(log_temperature, rate)?,
             target_entropy: (sac.target_entropy_per_action * shape.segment_actions_len as f64)
@@ -92,6 +97,7 @@ impl Sac {
     ) -> Result<Losses> {
         let rows = batch.rewards.len() as f32;
         let temperature = self.log_temperature.parameters.values()[0].exp();
+        outcome_step(&mut self.outcome_model, &mut self.shards, batch, pool);
         self.critics_step(policy, batch, pool, temperature)?;
         let critic = total(&self.shards);
         let penalty = self.action_rate_penalty * critic.q_size / rows;
@@ -122,9 +128,11 @@ impl Sac {
         let actor = self.actor.view();
         let targets = [first.target_view()?, second.target_view()?];
         let critics = [first.view(), second.view()];
+        let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
+        let model = model.as_ref();
         pool.for_each(&mut self.shards, |shard| {
             draw(shard, policy, &actor, batch.next_states(), &batch.next_noise);
-            shard.evaluate_critics(policy, &targets, batch.next_states());
+            shard.evaluate_critics(policy, &targets, model, batch.next_states());
             shard.set_targets(batch, |shard, row| {
                 let q = shard.q(0)[row].min(shard.q(1)[row]);
                 q - temperature * shard.log_densities[row]
@@ -155,9 +163,11 @@ impl Sac {
         let ActorWeights { temperature, penalty } = weights;
         let [first, second] = &self.critics;
         let (actor, critics) = (self.actor.view(), [first.view(), second.view()]);
+        let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
+        let model = model.as_ref();
         pool.for_each(&mut self.shards, |shard| {
             draw(shard, policy, &actor, batch.states(), &batch.noise);
-            shard.evaluate_critics(policy, &critics, batch.states());
+            shard.evaluate_critics(policy, &critics, model, batch.states());
             let smaller =
                 |shard: &BatchShard, row: usize| usize::from(shard.q(1)[row] < shard.q(0)[row]);
             shard.sums = LossSums::default();
@@ -168,7 +178,7 @@ impl Sac {
                 shard.sums.log_density += log_density;
             }
             let rows = shard.batch_rows();
-            shard.actions_gradient(&critics, |shard, row, index| {
+            shard.actions_gradient(&critics, model, |shard, row, index| {
                 if smaller(shard, row) == index { -1.0 / rows } else { 0.0 }
             });
             shard.unsquash();

@@ -12,12 +12,14 @@
 //!    normalised. Warm-up actions come from a part of the range (`exploration.warm_up_range`).
 //! 5. With policy `dmp` the actor's loss has a penalty on action changes (`action_rate_penalty`).
 //! 6. A time limit is not a termination: truncated episodes bootstrap, as in their code.
+//! 7. With `outcome_model` the critics also see predicted outcomes of the segment (`outcome.rs`).
 
 use candle_core::Result;
 use dmprl_shared::config::{ExperimentConfig, Td3Config};
 use dmprl_shared::policy::Policy;
 
-use super::batch_shard::{ActionRate, BatchShard, shards, total};
+use super::batch_shard::{ActionRate, BatchShard, outcome_step, shards, total};
+use super::outcome::new_outcome_model;
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::network::TrainableNetwork;
 use crate::update::thread_pool::ThreadPool;
@@ -30,6 +32,8 @@ pub struct Td3 {
     /// The critics Q_1 and Q_2 with their targets.
     pub critics: [TrainableNetwork; 2],
     config: Td3Config,
+    /// Predicts the outcomes that the critics see, if configured.
+    pub outcome_model: Option<TrainableNetwork>,
     polyak: f32,
     action_rate_penalty: f32,
     pub(super) shards: Vec<BatchShard>,
@@ -45,9 +49,11 @@ impl Td3 {
             new_critic(config, shape, "critic parameters")?,
             new_critic(config, shape, "second critic parameters")?,
         ];
+        let outcome_model = new_outcome_model(config, shape)?;
         Ok(Self {
             actor: new_actor(config, policy, true)?,
-            shards: shards(policy, shape, &critics),
+            shards: shards(policy, shape, &critics, outcome_model.as_ref()),
+            outcome_model,
             critics,
             config: config.algorithm.td3.clone(),
             polyak: config.algorithm.polyak as f32,
@@ -68,6 +74,7 @@ impl Td3 {
         update: u64,
     ) -> Result<Losses> {
         let updates_actor = update.is_multiple_of(self.config.actor_interval);
+        outcome_step(&mut self.outcome_model, &mut self.shards, batch, pool);
         self.critics_step(policy, batch, pool, updates_actor.then_some(self.polyak))?;
         let critic = total(&self.shards);
         let rows = batch.rewards.len() as f32;
@@ -99,13 +106,15 @@ impl Td3 {
         let critics = [first.view(), second.view()];
         let (std, clip) =
             (self.config.target_noise_std as f32, self.config.target_noise_clip as f32);
+        let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
+        let model = model.as_ref();
         pool.for_each(&mut self.shards, |shard| {
             shard.act(policy, &actor_target, batch.next_states());
             let noise = shard.part(&batch.next_noise);
             for (action, noise) in shard.policy.actions.iter_mut().zip(noise) {
                 *action = (*action + (std * noise).clamp(-clip, clip)).clamp(-1.0, 1.0);
             }
-            shard.evaluate_critics(policy, &targets, batch.next_states());
+            shard.evaluate_critics(policy, &targets, model, batch.next_states());
             shard.set_targets(batch, |shard, row| shard.q(0)[row].min(shard.q(1)[row]));
             shard.critic_backward(&critics, batch);
         });
@@ -119,13 +128,16 @@ impl Td3 {
     /// Does an actor step on the loss -mean Q_1(s, pi(s)), plus the penalty on action changes.
     fn actor_step(&mut self, policy: &Policy, batch: &Batch, pool: &mut ThreadPool, penalty: f32) {
         let (actor, critic) = (self.actor.view(), [self.critics[0].view()]);
+        let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
+        let model = model.as_ref();
         pool.for_each(&mut self.shards, |shard| {
             shard.act(policy, &actor, batch.states());
-            shard.evaluate_critics(policy, &critic, batch.states());
+            shard.evaluate_critics(policy, &critic, model, batch.states());
             shard.deterministic_policy_gradient(
                 policy,
                 &actor,
                 &critic,
+                model,
                 ActionRate { penalty, batch },
             );
         });

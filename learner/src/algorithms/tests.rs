@@ -5,17 +5,22 @@ use dmprl_shared::config::Layers;
 use rand::RngExt;
 
 use super::*;
-use crate::learner::tests::spec;
+use crate::learner::tests::{goal_rule, spec};
 use crate::parameters::Parameters;
 
 pub(super) struct Case {
     config: ExperimentConfig,
+    rule: Option<GoalRule>,
     pub(super) policy: Policy,
     pub(super) algorithm: Algorithm,
     pub(super) batch: Batch,
 }
 
 pub(super) fn case(keys: &[(&str, &str)]) -> Case {
+    case_with(keys, None)
+}
+
+fn case_with(keys: &[(&str, &str)], rule: Option<GoalRule>) -> Case {
     let mut layers = Layers::new();
     let common = [
         ("policy.hidden", "[24, 16]"),
@@ -31,7 +36,7 @@ pub(super) fn case(keys: &[(&str, &str)]) -> Case {
     }
     let config = layers.finish().unwrap();
     let policy = Policy::new(&config, &spec()).unwrap();
-    let mut algorithm = Algorithm::new(&config, &policy).unwrap();
+    let mut algorithm = Algorithm::new(&config, &policy, rule.as_ref()).unwrap();
     // Targets differ from their networks, so that confusing them fails the test. Gains and shifts
     // differ from one and zero.
     let mut random = seeds::stream(3, "test", 0);
@@ -57,8 +62,9 @@ pub(super) fn case(keys: &[(&str, &str)]) -> Case {
     fill(&mut batch.next_noise);
     fill(&mut batch.noise);
     fill(&mut batch.previous_actions);
+    fill(&mut batch.motion);
     batch.has_previous.iter_mut().step_by(3).for_each(|has| *has = 1.0);
-    Case { config, policy, algorithm, batch }
+    Case { config, rule, policy, algorithm, batch }
 }
 
 impl Case {
@@ -68,7 +74,7 @@ impl Case {
         let device = &Device::Cpu;
         let mut graph = Graph::new(&self.config, &self.policy, shape, device, &networks).unwrap();
         let expected_losses = graph.update(&self.policy, &self.batch, 1).unwrap();
-        let mut reference = Algorithm::new(&self.config, &self.policy).unwrap();
+        let mut reference = Algorithm::new(&self.config, &self.policy, self.rule.as_ref()).unwrap();
         reference.for_each_network(|name, network| graph.fetch(name, network)).unwrap();
 
         let losses = self.algorithm.update(&self.policy, &self.batch, 1).unwrap();
@@ -240,6 +246,24 @@ fn updates_fit_a_known_value_and_follow_its_gradient() {
     assert!(mean < 0.05, "actions are {mean} away from the best on average");
 }
 
+/// A case whose critics see predicted outcomes.
+fn case_with_outcomes(keys: &[(&str, &str)]) -> Case {
+    let keys = [&[("algorithm.outcome_model", "true")], keys].concat();
+    case_with(&keys, Some(GoalRule { goal_len: 2, desired: 2, ..goal_rule() }))
+}
+
+#[test]
+fn updates_with_predicted_outcomes_are_those_of_the_graph() {
+    for name in ["ddpg", "td3", "sac"] {
+        for norm in ["false", "true"] {
+            let keys = [("algorithm.name", name), ("algorithm.critic_layer_norm", norm)];
+            let mut case = case_with_outcomes(&keys);
+            assert_eq!(case.algorithm.networks().last().unwrap().0, "outcome_model");
+            case.check(&format!("{name} with outcomes, layer normalisation {norm}"));
+        }
+    }
+}
+
 #[test]
 fn the_number_of_threads_changes_no_bit_of_an_update() {
     let algorithms = ["ddpg", "td3", "sac"].into_iter();
@@ -254,7 +278,7 @@ fn the_number_of_threads_changes_no_bit_of_an_update() {
                 ("algorithm.critic_hidden", "[256, 256]"),
                 ("algorithm.batch_size", "250"),
             ];
-            let mut case = case(&keys);
+            let mut case = case_with_outcomes(&keys);
             for update in 1..=3 {
                 case.algorithm.update(&case.policy, &case.batch, update).unwrap();
             }

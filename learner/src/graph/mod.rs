@@ -4,6 +4,7 @@
 //! compare the losses, gradients and parameters of both. Unlike the kernels, candle's operations
 //! allocate their outputs.
 
+mod outcome;
 mod policy;
 
 use candle_core::{D, Device, Result, Tensor, Var};
@@ -15,6 +16,7 @@ use crate::algorithms::losses::Losses;
 use crate::update::kernels::{BETA1, BETA2, EPSILON};
 use crate::update::layer_norm::LayerNorm;
 use crate::update::network::TrainableNetwork;
+use outcome::Prediction;
 use policy::{DeviceStates, PolicyGraph, mlp};
 
 /// A network with its target and optimiser on the device.
@@ -138,9 +140,10 @@ impl Graph {
         let updates_actor = self.config.algorithm.name != AlgorithmName::Td3
             || update.is_multiple_of(td3.actor_interval);
         let states = self.states(policy, &batch.observations, &batch.inputs)?;
+        let prediction = self.outcome_step(&states, batch)?;
         let temperature = self.temperature()?;
         let CriticLosses { critic_loss, q_mean, q_size } =
-            self.critics_step(policy, batch, &temperature, updates_actor)?;
+            self.critics_step(policy, batch, &prediction, &temperature, updates_actor)?;
         let mut losses = Losses { critic_loss, q_mean, ..Losses::default() };
         if updates_actor {
             let penalty = self.config.algorithm.action_rate_penalty * q_size;
@@ -188,6 +191,7 @@ impl Graph {
         Ok(DeviceStates {
             inputs: self.on_device(inputs)?,
             starts: Tensor::from_vec(starts, (rows, 2), &self.device)?,
+            goal_distances: self.goal_distances(observations)?,
         })
     }
 
@@ -198,7 +202,11 @@ impl Graph {
             true => actions.narrow(1, 0, actions_len)?,
             false => actions.clone(),
         };
-        Tensor::cat(&[&states.inputs, &seen], D::Minus1)
+        let inputs = Tensor::cat(&[&states.inputs, &seen], D::Minus1)?;
+        match self.predict(&inputs, states)? {
+            Some(prediction) => Tensor::cat(&[&inputs, &prediction.features], D::Minus1),
+            None => Ok(inputs),
+        }
     }
 
     /// Returns the smallest Q of the algorithm's critics.
@@ -252,11 +260,15 @@ impl Graph {
         &mut self,
         policy: &Policy,
         batch: &Batch,
+        prediction: &Option<Prediction>,
         temperature: &Option<Tensor>,
         target_step: bool,
     ) -> Result<CriticLosses> {
         let targets = self.targets(policy, batch, temperature)?;
-        let inputs = self.on_device(&batch.critic_inputs)?;
+        let mut inputs = self.on_device(&batch.critic_inputs)?;
+        if let Some(prediction) = prediction {
+            inputs = Tensor::cat(&[&inputs, &prediction.features.detach()], D::Minus1)?;
+        }
         let (mut sum, mut q_mean, mut q_size) = (0.0, 0.0, 0.0);
         for (index, critic) in self.critics().iter().enumerate() {
             let q = self.q(critic, false, &inputs)?;

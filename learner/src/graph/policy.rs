@@ -52,6 +52,8 @@ pub(super) struct DeviceStates {
     pub inputs: Tensor,
     /// (y0, yd0) of every row and dimension, (B A, 2); empty without a DMP.
     pub starts: Tensor,
+    /// Desired minus achieved goal in thresholds, (B, 1, G), for the outcome model.
+    pub goal_distances: Option<Tensor>,
 }
 
 /// Computes a multilayer perceptron with flat parameters, with layer normalisation if given.

@@ -56,6 +56,7 @@ const GOAL: &str = r#"
 discount = 0.98
 action_rate_penalty = 0.0
 motion_bonus = 1.0
+outcome_model = true
 [exploration]
 kind = "segment"
 std = 0.2
@@ -109,6 +110,7 @@ critic_hidden = [256, 256]
 critic_layer_norm = false
 action_rate_penalty = 0.0
 motion_bonus = 0.0
+outcome_model = false
 [algorithm.td3]
 target_noise_std = 0.2
 target_noise_clip = 0.5
