@@ -2,10 +2,10 @@
 //! docs/benchmarks.md has its figures. Needs root.
 //!
 //!     cargo run --release --package dmprl-tests --example namespaces -- \
-//!         MS LOSS SECONDS WORKERS [RATE]
+//!         [tcp|tls] MS LOSS SECONDS WORKERS [RATE]
 //!
-//! MS: delay each way in milliseconds. WORKERS: 0 measures policies alone. RATE: total segments per
-//! second; unlimited without it.
+//! The protocol is `tcp` by default. MS: delay each way in milliseconds. WORKERS: 0 measures
+//! policies alone. RATE: total segments per second; unlimited without it.
 //!
 //! Prints the JSON of both ends, one line each, and the numbers of packets.
 
@@ -19,10 +19,13 @@ use dmprl_tests::program::executable;
 const TCP_BYTES_MAX: usize = 128 << 20;
 
 fn main() -> ExitCode {
-    let numbers: Vec<f64> =
-        std::env::args().skip(1).filter_map(|number| number.parse().ok()).collect();
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let protocol = arguments.first().filter(|word| ["tcp", "tls"].contains(&word.as_str()));
+    let numbers: Vec<f64> = arguments.iter().filter_map(|number| number.parse().ok()).collect();
     let [delay_ms, loss, seconds, workers, ref rate @ ..] = numbers[..] else {
-        eprintln!("usage: namespaces MILLISECONDS_EACH_WAY SHARE_LOST SECONDS WORKERS [RATE]");
+        eprintln!(
+            "usage: namespaces [tcp|tls] MILLISECONDS_EACH_WAY SHARE_LOST SECONDS WORKERS [RATE]"
+        );
         return ExitCode::from(2);
     };
     let hosts = match Hosts::new(2, TCP_BYTES_MAX, 1) {
@@ -34,7 +37,8 @@ fn main() -> ExitCode {
     };
     hosts.delay(Duration::from_secs_f64(delay_ms / 1e3));
     hosts.lose(loss);
-    let endpoint = format!("tcp/{}:7448", hosts.address(0));
+    let protocol = protocol.map_or("tcp", String::as_str);
+    let endpoint = format!("{protocol}/{}:7448", hosts.address(0));
     let (seconds, workers) = (seconds.to_string(), workers.to_string());
     let mut there = vec!["--connect".to_owned(), endpoint.clone(), "--workers".into(), workers];
     there.extend(rate.iter().flat_map(|rate| ["--rate".to_owned(), rate.to_string()]));
