@@ -13,7 +13,7 @@ O observation, A action.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from dmprl.hold import Hold, NoHoldError
 from dmprl.numpy_policy import NumpyPolicy
 from dmprl.policy_description import check
 from dmprl.policy_file import PolicyFile, PolicyFileError, read
+from dmprl.predict import Predictor
 
 Actions = NDArray[np.float64]
 
@@ -55,6 +56,7 @@ class Policy:
         self._deadline_s = np.inf
         self._clock: Callable[[], float] = time.monotonic
         self._decided: Actions = np.zeros((self.segment_steps, self.low.size))
+        self._predictor = Predictor(self, spec["observation_len"])
         self.reset()
 
     @classmethod
@@ -85,6 +87,14 @@ class Policy:
             f"{self.segment_steps} actions of {self.low.size} values per decision, "
             f"{spec['control_dt_s']:g} s per action>"
         )
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Policy:
+        """Returns a policy with the same limits, at the start of an episode."""
+        other = Policy(self.file)
+        other._rate, other._stated_hold = self._rate, self._stated_hold
+        other._hold_after, other._deadline_s = self._hold_after, self._deadline_s
+        other._clock = self._clock
+        return other
 
     @property
     def is_holding(self) -> bool:
@@ -169,6 +179,7 @@ class Policy:
         self._called_at_s: float | None = None
         self._missed = 0
         self._holding = False
+        self._predictor.reset()
 
     def segment(self, observation: ArrayLike) -> Actions:
         """Decides the next segment's actions, (K, A), in the environment's units.
@@ -216,6 +227,25 @@ class Policy:
         if self._holding:
             return self._limited(self._known_hold())
         return self._next_action()
+
+    def predict(
+        self,
+        observation: ArrayLike | Mapping[str, ArrayLike],
+        state: None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, None]:
+        """Returns the next actions as ``predict`` of Stable-Baselines3 does, with None as state.
+
+        For code written for Stable-Baselines3, such as its ``evaluate_policy``. The actions are
+        those of :meth:`action` and have no noise. The policy remembers its place in the segment, so
+        state the starts of episodes, or call :meth:`reset` before each.
+
+        :param observation: (O,), or (E, O) of E environments, or a mapping with such entries.
+        :param episode_start: (E,), whether each observation is the first of an episode.
+        :raises ValueError: as :meth:`segment`, or if the shapes differ from these.
+        """
+        return self._predictor.predict(observation, episode_start), None
 
     def hold(self) -> Actions:
         """Returns an action towards the hold, as far as the rate limit allows, (A,).

@@ -64,6 +64,34 @@ for folder in pathlib.Path(sys.argv[1]).iterdir():
 }
 
 #[test]
+fn predict_acts_as_one_policy_for_each_environment() {
+    let folder = tempfile::tempdir().unwrap();
+    exported::write(folder.path());
+    let script = "
+import copy, pathlib, dmprl, numpy as np
+for folder in pathlib.Path(sys.argv[1]).iterdir():
+    load = lambda: dmprl.Policy.load(folder / 'policy.safetensors')
+    rows = np.fromfile(folder / 'observations.f64').reshape(-1, load().spec['observation_len'])
+    together, alone = load(), [load() for _ in range(3)]
+    starts = np.ones(3, bool)
+    for step in range(20):
+        seen = rows[step : step + 3]
+        actions, state = together.predict(seen, None, starts, deterministic=True)
+        for policy, start in zip(alone, starts):
+            if start:
+                policy.reset()
+        expected = [policy.action(row) for policy, row in zip(alone, seen)]
+        assert state is None and (actions == expected).all(), (folder, step)
+        starts = np.array([False, step == 6, step % 4 == 0])
+    limited = load()
+    limited.limit(rate=0.1, hold=dmprl.Hold.position([0.5] * limited.low.size))
+    twin = copy.deepcopy(limited)
+    assert (twin.segment(rows[0]) == limited.segment(rows[0])).all(), folder
+";
+    python(script, folder.path());
+}
+
+#[test]
 fn numpy_limits_and_holds_as_rust_does() {
     let folder = tempfile::tempdir().unwrap();
     exported::write(folder.path());
