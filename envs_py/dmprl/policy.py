@@ -12,6 +12,7 @@ O observation, A action.
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ from dmprl.hold import Hold, NoHoldError
 from dmprl.numpy_policy import NumpyPolicy
 from dmprl.policy_description import check
 from dmprl.policy_file import PolicyFile, PolicyFileError, read
-from dmprl.predict import Predictor
+from dmprl.predict import observation_rows, start_flags
 
 Actions = NDArray[np.float64]
 
@@ -56,8 +57,9 @@ class Policy:
         self._deadline_s = np.inf
         self._clock: Callable[[], float] = time.monotonic
         self._decided: Actions = np.zeros((self.segment_steps, self.low.size))
-        self._predictor = Predictor(self, spec["observation_len"])
-        self.reset()
+        self._others: list[Policy] = []
+        """Act in the other environments of :meth:`predict`, each at its own step."""
+        self._start_episode()
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
@@ -154,6 +156,7 @@ class Policy:
                 raise ValueError(f"deadline_s is {deadline_s}: expected a positive number")
             self._deadline_s, self._clock, self._called_at_s = float(deadline_s), clock, None
         self._rate, self._stated_hold, self._hold_after = rates, held, after
+        self._others.clear()  # they have the limits from before
 
     def reset(self, y0: Sequence[float] | NDArray | None = None) -> None:
         """Starts an episode. The next action starts a segment.
@@ -171,6 +174,10 @@ class Policy:
             y0 = np.asarray(y0, np.float32)
             if y0.shape != self.low.shape or not np.isfinite(y0).all():
                 raise ValueError(f"y0 is {y0}: expected {self.low.size} finite numbers")
+        for policy in (self, *self._others):
+            policy._start_episode(y0)
+
+    def _start_episode(self, y0: NDArray[np.float32] | None = None) -> None:
         self._network.carried[:] = 0.0
         if y0 is not None:
             self._network.carried[0, : self.low.size] = y0
@@ -179,7 +186,6 @@ class Policy:
         self._called_at_s: float | None = None
         self._missed = 0
         self._holding = False
-        self._predictor.reset()
 
     def segment(self, observation: ArrayLike) -> Actions:
         """Decides the next segment's actions, (K, A), in the environment's units.
@@ -235,17 +241,27 @@ class Policy:
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
     ) -> tuple[Actions, None]:
-        """Returns the next actions as ``predict`` of Stable-Baselines3 does, with None as state.
+        """Returns the next actions, (A,) or (E, A), and None, as Stable-Baselines3's ``predict``.
 
         For code written for Stable-Baselines3, such as its ``evaluate_policy``. The actions are
-        those of :meth:`action` and have no noise. The policy remembers its place in the segment, so
-        state the starts of episodes, or call :meth:`reset` before each.
+        those of :meth:`action` and have no noise. The policy remembers each environment's place in
+        its segment, so state the starts of episodes, or call :meth:`reset` before each.
 
-        :param observation: (O,), or (E, O) of E environments, or a mapping with such entries.
+        :param observation: (O,), or (E, O) of E environments, or a mapping with such entries,
+            which are joined in the order of their names.
         :param episode_start: (E,), whether each observation is the first of an episode.
         :raises ValueError: as :meth:`segment`, or if the shapes differ from these.
         """
-        return self._predictor.predict(observation, episode_start), None
+        rows, is_batch = observation_rows(observation, self.spec["observation_len"])
+        starts = start_flags(episode_start, len(rows))
+        while len(self._others) + 1 < len(rows):
+            self._others.append(copy.deepcopy(self))
+        actions = []
+        for policy, row, starts_here in zip((self, *self._others), rows, starts, strict=False):
+            if starts_here:
+                policy._start_episode()
+            actions.append(policy.action(row))
+        return np.stack(actions) if is_batch else actions[0], None
 
     def hold(self) -> Actions:
         """Returns an action towards the hold, as far as the rate limit allows, (A,).

@@ -86,9 +86,11 @@ fn allocations_of_a_learner(algorithm: &str, hindsight: &str) -> u64 {
     let mut layers = Layers::new();
     // On-policy algorithms have no penalty on action changes.
     let penalty = if algorithm == "ndp" { "0.0" } else { "0.2" };
+    let outcome_model = if hindsight == "none" { "false" } else { "true" };
     let keys = [
         ("algorithm.name", algorithm),
         ("algorithm.action_rate_penalty", penalty),
+        ("algorithm.outcome_model", outcome_model),
         ("replay.hindsight", hindsight),
         ("policy.start", "zero"),
         ("policy.normalise_observations", "true"),

@@ -82,11 +82,18 @@ for folder in pathlib.Path(sys.argv[1]).iterdir():
                 policy.reset()
         expected = [policy.action(row) for policy, row in zip(alone, seen)]
         assert state is None and (actions == expected).all(), (folder, step)
-        starts = np.array([False, step == 6, step % 4 == 0])
+        # Episodes start in each environment alone, in the middle of segments of the others.
+        starts = np.array([step == 3, step == 6, step % 4 == 0])
+        if step == 11:
+            for policy in (together, *alone):
+                policy.reset()
     limited = load()
     limited.limit(rate=0.1, hold=dmprl.Hold.position([0.5] * limited.low.size))
     twin = copy.deepcopy(limited)
     assert (twin.segment(rows[0]) == limited.segment(rows[0])).all(), folder
+    together.limit(rate=0.1, hold=dmprl.Hold.position([0.5] * limited.low.size))
+    actions, _ = together.predict(rows[:3], None, np.ones(3, bool))
+    assert (np.abs(actions - 0.5) <= 0.1 + 1e-9).all(), folder
 ";
     python(script, folder.path());
 }

@@ -25,6 +25,7 @@
 //! 11. The actor's loss has a penalty on action changes (`action_rate_penalty`).
 //! 12. rho stays within `rho_range` of (1, 0, 0, 0), because the paper does not specify it. This
 //!     also holds for `paper`.
+//! 13. With `outcome_model` the critic also sees predicted outcomes of the segment (`outcome.rs`).
 
 use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;

@@ -8,8 +8,9 @@
 //! The model's input is that of a critic: observation and actions. Its outputs are a_k - a_0 for
 //! k = 1..K, where a_k is the achieved goal after step k. Its loss is the mean squared error.
 //! Lengths are in units of the goal's threshold. With the desired goal g and d_k = g - a_k, the
-//! critics see d_k / 4, tanh(d_k / 2) and tanh(|d_k| - 1), which changes its sign where the reward
-//! changes. The actor's gradient runs through these features and the model.
+//! critics see d_k / 4, tanh(d_k / 2) and tanh(|d_k| - 1). The sign of the last changes where the
+//! reward does, if that depends on the Euclidean distance of all entries. The actor's gradient runs
+//! through these features and the model.
 
 use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;

@@ -20,6 +20,7 @@
 //! 7. Learning rates of networks come from the configuration (1e-3 instead of 3e-4); that of the
 //!    temperature is 3e-4. Two updates per segment are 0.4 per environment step instead of 1.
 //!    Observations are normalised.
+//! 8. With `outcome_model` the critics also see predicted outcomes of the segment (`outcome.rs`).
 
 use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;

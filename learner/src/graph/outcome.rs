@@ -10,7 +10,7 @@ use crate::algorithms::batch::Batch;
 pub(super) struct Prediction {
     /// a_k - a_0 in thresholds of the goal, (B, K, G).
     motion: Tensor,
-    /// What the critics see, (B, F).
+    /// Inputs of the critics that follow from it, (B, F).
     pub(super) features: Tensor,
 }
 

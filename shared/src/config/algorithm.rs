@@ -85,9 +85,9 @@ pub struct AlgorithmConfig {
     /// It is added while less than half of the recent episodes move it, if goals are drawn when a
     /// batch is sampled and the reward is sparse.
     pub motion_bonus: f64,
-    /// The critics of DDPG, TD3 and SAC also see how a model predicts the distance between achieved
-    /// and desired goal after each step of the segment. The model learns from the same batches. It
-    /// needs an environment with a sparse goal rule and `critic = "segment"`.
+    /// Whether the critics of DDPG, TD3 and SAC also see how far from the desired goal a model
+    /// expects the achieved goal after each step of the segment. The model learns from the same
+    /// batches. It needs an environment with a sparse goal rule and `critic = "segment"`.
     pub outcome_model: bool,
     /// Settings of TD3.
     pub td3: Td3Config,
