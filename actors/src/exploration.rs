@@ -66,10 +66,12 @@ impl Exploration {
     }
 
     /// Converts the network's outputs to `u` with noise, within [-1, 1], and replaces the share
-    /// `exploration.random_segments` of the segments by random ones.
-    pub fn explore(&mut self, runner: &mut PolicyRunner) {
-        self.perturb(runner);
-        let share = self.config.random_segments;
+    /// `exploration.random_segments` of the segments by random ones. A `settled` policy gets the
+    /// share `exploration.settled_share` of both.
+    pub fn explore(&mut self, runner: &mut PolicyRunner, settled: bool) {
+        let scale = if settled { self.config.settled_share } else { 1.0 };
+        self.perturb(runner, (scale * self.config.std) as f32);
+        let share = scale * self.config.random_segments;
         if share == 0.0 {
             return;
         }
@@ -81,11 +83,11 @@ impl Exploration {
         }
     }
 
-    /// Converts the network's outputs to `u` with noise, within [-1, 1].
+    /// Converts the network's outputs to `u` with noise of scale `std`, within [-1, 1].
     ///
     /// A Gaussian policy draws from its own distribution; the configured noise then has no effect.
     /// If its standard deviations are learned parameters, its actions are not bounded.
-    fn perturb(&mut self, runner: &mut PolicyRunner) {
+    fn perturb(&mut self, runner: &mut PolicyRunner, std: f32) {
         if !runner.std.is_empty() {
             runner.decode();
             self.draw_unbounded(runner);
@@ -96,7 +98,6 @@ impl Exploration {
             self.draw(runner, columns);
             return;
         }
-        let std = self.config.std as f32;
         if self.config.kind == ExplorationKind::DmpParameters {
             let envs = runner.observations.len() / runner.policy.layout().observation_len;
             let outputs = runner.work.activations.output_mut(runner.policy.shape(), envs);
@@ -250,7 +251,7 @@ mod tests {
         let (mut runner, mut exploration) = scene(keys);
         runner.decode();
         let clean = runner.u.clone();
-        exploration.explore(&mut runner);
+        exploration.explore(&mut runner, false);
         runner.u.iter().zip(&clean).map(|(noisy, clean)| noisy - clean).collect()
     }
 
@@ -285,7 +286,7 @@ mod tests {
     fn noise_stays_within_the_bounds() {
         let keys = [("exploration.kind", "gaussian"), ("exploration.std", "2.0")];
         let (mut runner, mut exploration) = scene(&keys);
-        exploration.explore(&mut runner);
+        exploration.explore(&mut runner, false);
         assert!(runner.u.iter().all(|u| u.abs() <= 1.0));
         assert!(runner.u.contains(&1.0) && runner.u.contains(&-1.0));
     }
@@ -296,7 +297,7 @@ mod tests {
         let (mut runner, mut exploration) = scene(&keys);
         runner.decode();
         let clean = runner.u.clone();
-        exploration.explore(&mut runner);
+        exploration.explore(&mut runner, false);
         let explored = runner.u.clone();
         assert!(explored.iter().zip(&clean).filter(|(a, b)| a != b).count() > clean.len() / 2);
         // The decoder adds no noise.
@@ -318,6 +319,22 @@ mod tests {
         }
     }
 
+    #[test]
+    fn a_settled_policy_gets_its_share_of_noise_and_random_segments() {
+        let settled = [
+            ("exploration.random_segments", "1.0"),
+            ("exploration.std", "0.5"),
+            ("exploration.settled_share", "0.0"),
+        ];
+        let (mut runner, mut exploration) = scene(&settled);
+        runner.decode();
+        let clean = runner.u.clone();
+        exploration.explore(&mut runner, true);
+        assert_eq!(runner.u, clean);
+        exploration.explore(&mut runner, false);
+        assert!(held(&runner).into_iter().all(|held| held));
+    }
+
     /// Returns which segments hold one action over all steps.
     fn held(runner: &PolicyRunner) -> Vec<bool> {
         let segments = runner.u.chunks_exact(K * DIMS);
@@ -332,7 +349,7 @@ mod tests {
         let clean = runner.u.clone();
         let (mut count, mut largest) = (0, 0.0_f32);
         for _ in 0..20 {
-            exploration.explore(&mut runner);
+            exploration.explore(&mut runner, false);
             for (env, held) in held(&runner).into_iter().enumerate() {
                 let segment = env * K * DIMS..(env + 1) * K * DIMS;
                 assert!(held || runner.u[segment.clone()] == clean[segment.clone()]);
@@ -385,7 +402,7 @@ mod tests {
             scene(&[("algorithm.name", "sac"), ("exploration.std", "0.0")]);
         runner.decode();
         let mean = runner.u.clone();
-        exploration.explore(&mut runner);
+        exploration.explore(&mut runner, false);
         assert!(runner.u.iter().zip(&mean).all(|(u, mean)| u != mean && u.abs() <= 1.0));
         // With learned standard deviations: also outside the bounds.
         let ndp = [
@@ -398,7 +415,7 @@ mod tests {
         let (mut runner, mut exploration) = scene(&ndp);
         runner.decode();
         let mean = runner.work.actions.clone();
-        exploration.explore(&mut runner);
+        exploration.explore(&mut runner, false);
         let drawn: Vec<f32> = runner.u.iter().zip(&mean).map(|(u, mean)| u - mean).collect();
         assert!((std(&drawn) - 1.0).abs() < 0.1, "{}", std(&drawn));
         assert!(runner.u.iter().any(|u| u.abs() > 1.0));
@@ -407,7 +424,7 @@ mod tests {
     #[test]
     fn pink_noise_is_reset_at_the_end_of_an_episode() {
         let (mut runner, mut exploration) = scene(&[("exploration.kind", "pink")]);
-        exploration.explore(&mut runner);
+        exploration.explore(&mut runner, false);
         exploration.episode_ended(3);
         let sources = |env: usize| &exploration.pink[env * DIMS..(env + 1) * DIMS];
         assert!(sources(3).iter().all(|source| source.step == 0));

@@ -190,7 +190,7 @@ impl Rollout {
                 self.loaded_version = self.snapshot.version;
             }
             self.runner.run_network();
-            self.exploration.explore(&mut self.runner);
+            self.exploration.explore(&mut self.runner, self.snapshot.settled);
         }
         let policy_version = if warming_up { 0 } else { self.snapshot.version };
         self.environments.step_segment(self.runner.actions()).map_err(RolloutError::from)?;

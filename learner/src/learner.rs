@@ -196,7 +196,7 @@ impl Learner {
         }
         let Self { config, policy, regime, replay, sampler, hindsight, counters, .. } = self;
         if let Some(hindsight) = hindsight {
-            hindsight.count_motion(replay);
+            hindsight.read_recent(replay);
         }
         let (normaliser, hindsight) = (self.normaliser.as_ref(), hindsight.as_ref());
         match regime {
@@ -312,6 +312,11 @@ impl Learner {
         self.counters.policy_version += 1;
         self.snapshot.version = self.counters.policy_version;
         self.snapshot.env_steps = self.counters.env_steps;
+        if let Some(hindsight) = &mut self.hindsight {
+            // Also before the first update after a resume.
+            hindsight.read_recent(&self.replay);
+            self.snapshot.settled = hindsight.is_settled();
+        }
         self.regime.read_policy(&mut self.snapshot.values)?;
         if let Some(normaliser) = &self.normaliser {
             normaliser.fold(self.policy.shape(), &mut self.snapshot.values);

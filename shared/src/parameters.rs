@@ -12,6 +12,9 @@ pub struct ParameterSnapshot {
     pub env_steps: u64,
     /// Hash of the architecture that `values` belongs to.
     pub architecture_hash: u64,
+    /// Whether most recent episodes move the achieved goal. Workers then explore less
+    /// (`exploration.settled_share`).
+    pub settled: bool,
     /// All parameters as one flat vector.
     pub values: Vec<f32>,
 }
@@ -42,20 +45,20 @@ pub enum SnapshotError {
 }
 
 impl ParameterSnapshot {
-    /// Returns the CRC-32 of version, steps, architecture hash and values.
+    /// Returns the CRC-32 of all fields.
     #[must_use]
     pub fn checksum(&self) -> u32 {
-        checksum(self.version, self.env_steps, self.architecture_hash, &self.values)
+        let Self { version, env_steps, architecture_hash, settled, .. } = *self;
+        checksum([version, env_steps, architecture_hash, settled.into()], &self.values)
     }
 }
 
-/// Returns the checksum of a snapshot whose values are not in a `Vec` yet.
+/// Returns the checksum of a snapshot whose values are not in a `Vec` yet. `fields` are version,
+/// steps, architecture hash, and 1 if it is settled, else 0.
 #[must_use]
-pub fn checksum(version: u64, env_steps: u64, architecture_hash: u64, values: &[f32]) -> u32 {
+pub fn checksum(fields: [u64; 4], values: &[f32]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();
-    for word in [version, env_steps, architecture_hash] {
-        hasher.update(&word.to_le_bytes());
-    }
+    fields.iter().for_each(|field| hasher.update(&field.to_le_bytes()));
     hasher.update(bytemuck::cast_slice(values));
     hasher.finalize()
 }

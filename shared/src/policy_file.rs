@@ -291,6 +291,7 @@ impl<'a> Contents<'a> {
             version: self.number(VERSION_KEY)?,
             env_steps: self.number(STEPS_KEY)?,
             architecture_hash: policy.architecture_hash(),
+            settled: false,
             values,
         })
     }

@@ -138,7 +138,8 @@ fn policy(hold: Option<&Hold>) -> Vec<u8> {
     let mut values = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
     values.iter_mut().for_each(|value| *value *= 5.0);
     let architecture_hash = policy.architecture_hash();
-    let snapshot = ParameterSnapshot { version: 1, env_steps: 0, architecture_hash, values };
+    let snapshot =
+        ParameterSnapshot { version: 1, env_steps: 0, architecture_hash, settled: false, values };
     policy_file::encode(&policy, &snapshot, None, hold).unwrap()
 }
 

@@ -107,7 +107,8 @@ pub fn policy(task: &str, keys: &[(&str, &str)]) -> OpenedPolicy {
     // Initial networks hardly leave the middle of the tanh.
     values.iter_mut().for_each(|value| *value *= 2.0);
     let architecture_hash = policy.architecture_hash();
-    let snapshot = ParameterSnapshot { version: 7, env_steps: 100, architecture_hash, values };
+    let snapshot =
+        ParameterSnapshot { version: 7, env_steps: 100, architecture_hash, settled: false, values };
     OpenedPolicy { policy, snapshot, origin: None, hold: None }
 }
 

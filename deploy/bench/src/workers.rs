@@ -104,6 +104,7 @@ impl Workers {
             // Past the warm-up, so that the network decides from the first segment on.
             env_steps: config.exploration.warm_up_steps,
             architecture_hash: policy.architecture_hash(),
+            settled: false,
             values: policy.initial_parameters(&mut random),
         };
         let mut end = serve(domain.path(), &Plan::new(&setup.config, setup.run_id, &policy))?;

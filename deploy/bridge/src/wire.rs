@@ -278,7 +278,8 @@ pub fn write_snapshot(snapshot: &ParameterSnapshot) -> Vec<u8> {
     let values: &[u8] = bytemuck::cast_slice(&snapshot.values);
     let count = u32::try_from(snapshot.values.len()).unwrap_or(u32::MAX);
     let head = Head { magic: MAGIC, count, checksum: snapshot.checksum(), run_state: 0 };
-    let words = [snapshot.version, snapshot.env_steps, snapshot.architecture_hash];
+    let ParameterSnapshot { version, env_steps, architecture_hash, settled, .. } = *snapshot;
+    let words = [version, env_steps, architecture_hash, settled.into()];
     [bytemuck::bytes_of(&head), bytemuck::cast_slice(&words), values].concat()
 }
 
@@ -287,7 +288,7 @@ pub fn write_snapshot(snapshot: &ParameterSnapshot) -> Vec<u8> {
 /// # Errors
 /// It is not a snapshot, or it is damaged.
 pub fn read_snapshot(message: &[u8]) -> Result<ParameterSnapshot, WireError> {
-    const WORDS: usize = 3 * size_of::<u64>();
+    const WORDS: usize = 4 * size_of::<u64>();
     let (head, rest) = head(message)?;
     let expected = (head.count as usize).saturating_mul(size_of::<f32>()).saturating_add(WORDS);
     if expected != rest.len() {
@@ -295,9 +296,10 @@ pub fn read_snapshot(message: &[u8]) -> Result<ParameterSnapshot, WireError> {
         return Err(WireError::Length { expected, got: message.len() });
     }
     let (words, values) = rest.split_at(WORDS);
-    let [version, env_steps, architecture_hash] = bytemuck::pod_read_unaligned(words);
-    let values = bytemuck::pod_collect_to_vec(values);
-    let snapshot = ParameterSnapshot { version, env_steps, architecture_hash, values };
+    let [version, env_steps, architecture_hash, settled]: [u64; 4] =
+        bytemuck::pod_read_unaligned(words);
+    let (settled, values) = (settled != 0, bytemuck::pod_collect_to_vec(values));
+    let snapshot = ParameterSnapshot { version, env_steps, architecture_hash, settled, values };
     let (expected, got) = (head.checksum, snapshot.checksum());
     if got != expected {
         return Err(WireError::Checksum { expected, got });
@@ -384,6 +386,7 @@ mod tests {
             version: 4,
             env_steps: 100,
             architecture_hash: 7,
+            settled: true,
             values: vec![0.25, -3.0],
         };
         let written = write_snapshot(&snapshot);

@@ -7,6 +7,8 @@ episode, the arm does not sag, and the observation holds more:
 
 - With joint displacements, the joints' angles and velocities come first.
 - The fingers' velocity follows their width, so that a movement primitive can start from both.
+- Each object's position relative to the end effector follows its velocities. Whether the arm
+  touches an object depends on this small difference.
 """
 
 from __future__ import annotations
@@ -34,8 +36,9 @@ ON_TABLE_SHARE = 0.3
 """Share of the goals of pick and place that are on the table, besides those in its box."""
 POSE_ENTRIES = 7
 """Entries of a free object in the positions: its position and a quaternion."""
-OBJECT_ENTRIES = 12
-"""Entries of an object in an observation: position, rotation and both velocities."""
+OBJECT_ENTRIES = 15
+"""Entries of an object in an observation: position, rotation, both velocities, and position
+relative to the end effector."""
 
 
 class PandaObjects(GoalTask):
@@ -100,6 +103,7 @@ class PandaObjects(GoalTask):
             names += [f"{angle}_{name}" for angle in ("roll", "pitch", "yaw")]
             names += [f"velocity_{name}_{axis}" for axis in "xyz"]
             names += [f"angular_velocity_{name}_{axis}" for axis in "xyz"]
+            names += [f"end_effector_to_{name}_{axis}" for axis in "xyz"]
         return names
 
     def draw_start(  # noqa: D102 - inherited
@@ -137,6 +141,9 @@ class PandaObjects(GoalTask):
             out[..., at : at + 3] = pose[..., :3]
             euler_angles(pose[..., 3:], out[..., at + 3 : at + 6])
             out[..., at + 6 : at + 12] = sensors[..., 3 + 6 * index : 9 + 6 * index]
+            np.subtract(
+                pose[..., :3], fields["site_xpos"][..., 0, :], out=out[..., at + 12 : at + 15]
+            )
             at += OBJECT_ENTRIES
 
     def observe_arm(self, fields: Fields, out: NDArray[np.float64]) -> None:

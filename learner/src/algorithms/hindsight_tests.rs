@@ -112,7 +112,7 @@ fn a_step_that_moves_the_achieved_goal_gets_a_bonus_while_few_episodes_do() {
     config.replay.moved_share = 1.0;
     config.algorithm.motion_bonus = 0.5;
     let mut hindsight = GoalSampler::from_config(Some(&rule(None)), &config);
-    hindsight.as_mut().unwrap().count_motion(&replay);
+    hindsight.as_mut().unwrap().read_recent(&replay);
     let (rows, range) = rows_of(&replay, &config.algorithm, hindsight);
     // -1 - 0.5, and 0.5 + 0.25 for two steps that move it.
     let expected = [

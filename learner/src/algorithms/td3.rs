@@ -12,7 +12,9 @@
 //!    normalised. Warm-up actions come from a part of the range (`exploration.warm_up_range`).
 //! 5. With policy `dmp` the actor's loss has a penalty on action changes (`action_rate_penalty`).
 //! 6. A time limit is not a termination: truncated episodes bootstrap, as in their code.
-//! 7. With `outcome_model` the critics also see predicted outcomes of the segment (`outcome.rs`).
+//! 7. The larger value of the two target critics may have a weight, too (`target_smaller_weight`),
+//!    as in Fujimoto et al. 2019, "Off-policy deep reinforcement learning without exploration".
+//! 8. With `outcome_model` the critics also see predicted outcomes of the segment (`outcome.rs`).
 
 use candle_core::Result;
 use dmprl_shared::config::{ExperimentConfig, Td3Config};
@@ -106,6 +108,7 @@ impl Td3 {
         let critics = [first.view(), second.view()];
         let (std, clip) =
             (self.config.target_noise_std as f32, self.config.target_noise_clip as f32);
+        let weight = self.config.target_smaller_weight as f32;
         let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
         let model = model.as_ref();
         pool.for_each(&mut self.shards, |shard| {
@@ -115,7 +118,10 @@ impl Td3 {
                 *action = (*action + (std * noise).clamp(-clip, clip)).clamp(-1.0, 1.0);
             }
             shard.evaluate_critics(policy, &targets, model, batch.next_states());
-            shard.set_targets(batch, |shard, row| shard.q(0)[row].min(shard.q(1)[row]));
+            shard.set_targets(batch, |shard, row| {
+                let (first, second) = (shard.q(0)[row], shard.q(1)[row]);
+                weight * first.min(second) + (1.0 - weight) * first.max(second)
+            });
             shard.critic_backward(&critics, batch);
         });
         drop((actor_target, targets, critics));

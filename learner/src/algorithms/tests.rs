@@ -120,7 +120,7 @@ fn assert_within(tolerance: f64, name: &str, got: &[f32], expected: &[f32]) {
 
 #[test]
 fn an_update_equals_automatic_differentiation() {
-    let cases: [&[(&str, &str)]; 13] = [
+    let cases: [&[(&str, &str)]; 14] = [
         &[],
         &[("policy.kind", "mlp")],
         &[("policy.start", "observed")],
@@ -131,6 +131,7 @@ fn an_update_equals_automatic_differentiation() {
         &[("dmp.integrator", "paper"), ("dmp.alpha_y", "25.0"), ("dmp.basis_count", "3")],
         &[("algorithm.critic_layer_norm", "true"), ("policy.start", "carry")],
         &[("algorithm.critic_layer_norm", "true"), ("policy.kind", "mlp")],
+        &[("algorithm.td3.target_smaller_weight", "0.75")],
         &[("algorithm.action_rate_penalty", "0.7")],
         &[("algorithm.action_rate_penalty", "0.7"), ("policy.kind", "mlp")],
         &[("algorithm.action_rate_penalty", "0.7"), ("policy.start", "carry")],

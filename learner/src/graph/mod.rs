@@ -219,6 +219,18 @@ impl Graph {
         Ok(q)
     }
 
+    /// Returns the value of the target critics.
+    fn target_q(&self, inputs: &Tensor) -> Result<Tensor> {
+        let algorithm = &self.config.algorithm;
+        if algorithm.name != AlgorithmName::Td3 {
+            return self.smallest_q(true, inputs);
+        }
+        let [first, second] = ["critic_1", "critic_2"].map(|critic| self.q(critic, true, inputs));
+        let (first, second) = (first?, second?);
+        let weight = algorithm.td3.target_smaller_weight;
+        (first.minimum(&second)? * weight)? + (first.maximum(&second)? * (1.0 - weight))?
+    }
+
     fn targets(
         &self,
         policy: &Policy,
@@ -245,7 +257,7 @@ impl Graph {
             None => means.means.tanh()?,
         };
         let inputs = self.critic_inputs(&states, &means.with_end_state(&u)?)?;
-        let mut value = self.smallest_q(true, &inputs)?;
+        let mut value = self.target_q(&inputs)?;
         if let Some(bonus) = bonus {
             value = (value - bonus)?;
         }

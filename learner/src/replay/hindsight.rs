@@ -7,6 +7,7 @@
 //! 3. If the task ends episodes at the goal, a window ends at its first step that reaches the new
 //!    goal. A window that is short only because the episode's own goal ended it keeps that goal,
 //!    because a missing action is not a zero action.
+//! 4. Goals in the region of the task are preferred ([`super::region`]).
 
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::goal_rule::GoalRule;
@@ -14,7 +15,12 @@ use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
 use super::motion::Motion;
+use super::recent::Recent;
+use super::region::Region;
 use super::{Replay, Sampler, Window};
+
+/// Draws after which a goal outside the region is taken.
+const DRAWS_MAX: usize = 8;
 
 /// Draws goals for windows.
 #[derive(Debug, Clone)]
@@ -25,6 +31,8 @@ pub struct GoalSampler {
     /// Share of the windows that get another goal.
     share: f64,
     motion: Option<Motion>,
+    region: Region,
+    recent: Recent,
 }
 
 /// An observation row of the replay, whose achieved goal a window gets.
@@ -67,20 +75,30 @@ impl GoalSampler {
     #[must_use]
     pub fn new(rule: Option<&GoalRule>, strategy: Hindsight, share: f64) -> Option<Self> {
         let rule = rule.filter(|_| strategy != Hindsight::None)?;
-        Some(Self { rule: rule.clone(), strategy, share, motion: None })
+        let (region, recent) = (Region::default(), Recent::default());
+        Some(Self { rule: rule.clone(), strategy, share, motion: None, region, recent })
     }
 
-    /// Counts the recent episodes that moved the achieved goal. Call it before a batch is sampled.
-    pub fn count_motion(&mut self, replay: &Replay) {
+    /// Finds the task's region and counts motion in the recent episodes, if that is due. Call it
+    /// before a batch is sampled.
+    pub fn read_recent(&mut self, replay: &Replay) {
+        let Some(slots) = self.recent.read(replay) else { return };
+        self.region = Region::new(&self.rule, replay, &slots);
         if let Some(motion) = &mut self.motion {
-            motion.count(&self.rule, replay);
+            motion.count(&self.rule, replay, &slots);
         }
+    }
+
+    /// Returns whether most recent episodes move the achieved goal.
+    #[must_use]
+    pub fn is_settled(&self) -> bool {
+        self.motion.as_ref().is_some_and(Motion::is_settled)
     }
 
     /// Draws a window, preferably from an episode that moved the achieved goal, as configured.
     pub fn draw_window(&self, replay: &Replay, sampler: &mut Sampler) -> Option<Window> {
         match &self.motion {
-            Some(motion) => motion.draw(&self.rule, replay, sampler),
+            Some(motion) => motion.draw(&self.rule, &self.region, replay, sampler),
             None => sampler.draw(replay),
         }
     }
@@ -99,7 +117,7 @@ impl GoalSampler {
             return 0.0;
         };
         (1..=steps).rev().fold(0.0, |sum, step| {
-            let moves = motion.step_moves(&self.rule, replay, window, step);
+            let moves = motion.step_moves(&self.rule, &self.region, replay, window, step);
             discount * sum + if moves { motion.bonus() } else { 0.0 }
         })
     }
@@ -112,7 +130,8 @@ impl GoalSampler {
         Some([low, high + (f64::from(bonus) / (1.0 - discount)) as f32])
     }
 
-    /// Draws a goal for a window. Returns `None` if the window keeps its own.
+    /// Draws a goal for a window, in the region if one of some draws is. Returns `None` if the
+    /// window keeps its own.
     ///
     /// Steps of the episode that have not arrived, or have been replaced, are not drawn.
     pub fn draw(
@@ -132,14 +151,22 @@ impl GoalSampler {
             + usize::from(window.offset);
         let end = (live.last_rank - live.first_rank) as usize * steps_max
             + usize::from(replay.slots[live.newest as usize].steps_len);
-        let step = match self.strategy {
-            Hindsight::Final => end,
-            Hindsight::Episode => random.random_range(1..=end),
-            _ => random.random_range(first + 1..=end.max(first + 1)),
-        };
-        let rank = live.first_rank + ((step - 1) / steps_max) as u32;
-        let slot = replay.slot_at(live.newest, rank)?;
-        Some(GoalRow { slot, row: (step - 1) % steps_max + 1 })
+        let mut drawn = None;
+        for _ in 0..DRAWS_MAX {
+            let step = match self.strategy {
+                Hindsight::Final => end,
+                Hindsight::Episode => random.random_range(1..=end),
+                _ => random.random_range(first + 1..=end.max(first + 1)),
+            };
+            let rank = live.first_rank + ((step - 1) / steps_max) as u32;
+            let slot = replay.slot_at(live.newest, rank)?;
+            let row = (step - 1) % steps_max + 1;
+            drawn = Some(GoalRow { slot, row });
+            if self.region.contains(self.rule.achieved(replay.observation_row(slot, row))) {
+                break;
+            }
+        }
+        drawn
     }
 }
 
@@ -276,6 +303,25 @@ mod tests {
         let goals = sampler(Hindsight::Episode, 1.0, None);
         assert_eq!(drawn(&replay, &goals, 2, 0), goals_from(17, 19));
         assert_eq!(drawn(&replay, &goals, 0, 1), goals_from(31, 39));
+    }
+
+    #[test]
+    fn goals_in_the_region_are_preferred_and_others_are_taken_where_there_is_none() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 86.0, 9, TRUNCATED); // the region ends near the desired goal, 90
+        let mut goals = sampler(Hindsight::Future, 1.0, None);
+        goals.region = Region::new(&goals.rule, &replay, &[0, 1, 2]);
+        let mut counts = [0; 10];
+        let window = replay.window(0, 0).unwrap();
+        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
+        for _ in 0..20_000 {
+            let row = goals.draw(&replay, &window, &mut random).unwrap();
+            counts[replay.achieved_goal(&goals.rule, row).values[0] as usize - 86] += 1;
+        }
+        // Four of nine goals are in the region; eight draws miss it with (5/9)^8 = 0.009.
+        assert!(counts[1..=4].iter().all(|&count| count > 4_500), "{counts:?}");
+        assert!((100..300).contains(&counts[5..].iter().sum::<u32>()), "{counts:?}");
+        assert_eq!(drawn(&replay, &goals, 2, 0), goals_from(93, 95));
     }
 
     #[test]

@@ -10,6 +10,8 @@ mod episodes;
 mod file;
 mod hindsight;
 mod motion;
+mod recent;
+mod region;
 mod window;
 
 use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};

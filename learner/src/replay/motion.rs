@@ -5,10 +5,13 @@
 //! 1. A share of the windows comes from episodes that moved the achieved goal.
 //! 2. A step that moves it gets a bonus while fewer than half of the recent episodes moved it. The
 //!    bonus is added when a batch is sampled, so it starts and ends for all windows at once.
+//!
+//! Windows and bonus are for motion within the region of the task ([`super::region`]), because a
+//! policy that strikes an object as far as it can has not learned to place it.
 
 use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 
-use super::hindsight::Goal;
+use super::region::Region;
 use super::{Replay, Sampler, Window};
 
 /// An episode moves the achieved goal if its end is farther from its start than this many
@@ -16,10 +19,6 @@ use super::{Replay, Sampler, Window};
 const EPISODE_MOVES: f64 = 0.4;
 /// A step moves the achieved goal if it does so by more than this many thresholds.
 const STEP_MOVES: f64 = 0.04;
-/// Newest segments whose episodes are counted.
-const RECENT_SEGMENTS: u64 = 600;
-/// Inserted segments between two counts.
-const COUNT_EVERY: u64 = 100;
 /// Share of the recent episodes below which steps get a bonus.
 const RARE: f64 = 0.5;
 /// Draws after which a window is taken from any episode.
@@ -33,9 +32,8 @@ pub(super) struct Motion {
     share: f64,
     /// Reward of a step that moves the achieved goal, while few episodes do.
     bonus: f32,
-    is_rare: bool,
-    /// Number of inserted segments for which `is_rare` is due.
-    due: u64,
+    /// Share of the recent episodes that moved the achieved goal; `None` before any has ended.
+    moving: Option<f64>,
 }
 
 impl Motion {
@@ -45,47 +43,38 @@ impl Motion {
     pub(super) fn new(rule: &GoalRule, share: f64, factor: f64) -> Option<Self> {
         let GoalReward::Sparse { threshold, reached, missed } = rule.reward else { return None };
         let bonus = (factor * (reached - missed)) as f32;
-        (share > 0.0 || factor > 0.0).then_some(Self {
-            threshold,
-            share,
-            bonus,
-            is_rare: false,
-            due: 0,
-        })
+        (share > 0.0 || factor > 0.0).then_some(Self { threshold, share, bonus, moving: None })
     }
 
-    /// Counts the recent episodes, if a count is due. It covers segments that a replay still has
-    /// when the next count is due, so a resumed run gets the same result.
-    pub(super) fn count(&mut self, rule: &GoalRule, replay: &Replay) {
-        let inserted = replay.inserted - replay.inserted % COUNT_EVERY;
-        if self.bonus == 0.0 || inserted < self.due {
-            return;
-        }
-        self.due = inserted + COUNT_EVERY;
-        let newest = replay.inserted - inserted;
-        let ring = (replay.slots.len() - replay.demonstrations) as u64;
+    /// Counts the episodes that end in one of the recent `slots`.
+    pub(super) fn count(&mut self, rule: &GoalRule, replay: &Replay, slots: &[u32]) {
         let (mut ended, mut moved) = (0_u32, 0_u32);
-        let recent = RECENT_SEGMENTS.min(ring.saturating_sub(COUNT_EVERY)).min(inserted);
-        for back in newest..newest + recent {
-            let Some(slot) = replay.slot_before(back) else { break };
+        for &slot in slots {
             let segment = &replay.slots[slot as usize];
             if segment.terminated || segment.truncated {
                 ended += 1;
-                moved += u32::from(self.moved(rule, replay, slot));
+                moved += u32::from(self.moved(rule, replay, slot).is_some());
             }
         }
-        self.is_rare = f64::from(moved) < RARE * f64::from(ended);
+        self.moving = (ended > 0).then(|| f64::from(moved) / f64::from(ended));
     }
 
     /// Returns the bonus of a step that moves the achieved goal, 0 while many episodes do.
     pub(super) fn bonus(&self) -> f32 {
-        if self.is_rare { self.bonus } else { 0.0 }
+        if self.moving.is_some_and(|share| share < RARE) { self.bonus } else { 0.0 }
     }
 
-    /// Draws a window, with probability `share` from an episode that moved the achieved goal.
+    /// Returns whether many recent episodes moved the achieved goal.
+    pub(super) fn is_settled(&self) -> bool {
+        self.moving.is_some_and(|share| share >= RARE)
+    }
+
+    /// Draws a window, with probability `share` from an episode that moved the achieved goal and
+    /// ended in the region.
     pub(super) fn draw(
         &self,
         rule: &GoalRule,
+        region: &Region,
         replay: &Replay,
         sampler: &mut Sampler,
     ) -> Option<Window> {
@@ -94,7 +83,7 @@ impl Motion {
             return Some(window);
         }
         for _ in 1..DRAWS_MAX {
-            if self.moved(rule, replay, window.slot) {
+            if self.moved(rule, replay, window.slot).is_some_and(|end| region.contains(end)) {
                 break;
             }
             window = sampler.draw(replay)?;
@@ -102,38 +91,29 @@ impl Motion {
         Some(window)
     }
 
-    /// Returns whether the live part of an episode ends far from where it began.
-    fn moved(&self, rule: &GoalRule, replay: &Replay, slot: u32) -> bool {
+    /// Returns where the live part of an episode ends, if that is far from where it began.
+    fn moved<'a>(&self, rule: &GoalRule, replay: &'a Replay, slot: u32) -> Option<&'a [f32]> {
         let live = replay.live(slot);
-        let Some(first) = replay.slot_at(live.newest, live.first_rank) else { return false };
+        let first = replay.slot_at(live.newest, live.first_rank)?;
         let steps = usize::from(replay.slots[live.newest as usize].steps_len);
         let start = rule.achieved(replay.observation_row(first, 0));
         let end = rule.achieved(replay.observation_row(live.newest, steps));
-        rule.distance(start, end) > EPISODE_MOVES * self.threshold
+        (rule.distance(start, end) > EPISODE_MOVES * self.threshold).then_some(end)
     }
 
-    /// Returns whether step `step` of a window, counted from 1, moves the achieved goal.
+    /// Returns whether step `step` of a window, counted from 1, moves the achieved goal and leaves
+    /// it in the region.
     pub(super) fn step_moves(
         &self,
         rule: &GoalRule,
+        region: &Region,
         replay: &Replay,
         window: &Window,
         step: usize,
     ) -> bool {
-        let before =
-            Goal { rule, values: rule.achieved(replay.observation_after(window, step - 1)) };
-        replay.goal_distance(window, step, before) > STEP_MOVES * self.threshold
-    }
-}
-
-impl Replay {
-    /// Returns the slot of the segment that was inserted `back` segments before the newest, of
-    /// those that replace each other.
-    fn slot_before(&self, back: u64) -> Option<u32> {
-        let ring = self.slots.len() - self.demonstrations;
-        let position = self.head.checked_sub(self.demonstrations)? + 2 * ring;
-        let slot = self.demonstrations + position.checked_sub(1 + back as usize)? % ring;
-        (slot < self.filled).then_some(slot as u32)
+        let before = rule.achieved(replay.observation_after(window, step - 1));
+        let after = rule.achieved(replay.observation_after(window, step));
+        rule.distance(before, after) > STEP_MOVES * self.threshold && region.contains(after)
     }
 }
 
@@ -142,6 +122,7 @@ mod tests {
     use dmprl_shared::config::Windows;
     use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TRUNCATED};
 
+    use super::super::recent::Recent;
     use super::*;
     use crate::learner::tests::goal_rule;
 
@@ -174,25 +155,32 @@ mod tests {
         Motion::new(&rule(), share, 1.0).unwrap()
     }
 
+    /// Counts the recent episodes, if that is due.
+    fn count(motion: &mut Motion, recent: &mut Recent, replay: &Replay) {
+        if let Some(slots) = recent.read(replay) {
+            motion.count(&rule(), replay, &slots);
+        }
+    }
+
     #[test]
     fn steps_get_a_bonus_only_while_few_recent_episodes_move_the_goal() {
         let mut replay = Replay::new(LAYOUT, 2_000, 1, 1);
-        let mut motion = motion(0.0);
-        motion.count(&rule(), &replay);
-        assert_eq!(motion.bonus(), 0.0, "no episode has ended");
+        let (mut motion, mut recent) = (motion(0.0), Recent::default());
+        count(&mut motion, &mut recent, &replay);
+        assert_eq!((motion.bonus(), motion.is_settled()), (0.0, false), "no episode has ended");
         for number in 0..50 {
             episode(&mut replay, number, if number < 24 { 0.5 } else { 0.3 });
         }
-        motion.count(&rule(), &replay);
-        assert_eq!(motion.bonus(), 2.0, "24 of 50");
+        count(&mut motion, &mut recent, &replay);
+        assert_eq!((motion.bonus(), motion.is_settled()), (2.0, false), "24 of 50");
         episode(&mut replay, 50, 0.5);
-        motion.count(&rule(), &replay);
+        count(&mut motion, &mut recent, &replay);
         assert_eq!(motion.bonus(), 2.0, "the next count is due after 100 segments");
         for number in 51..100 {
             episode(&mut replay, number, 0.5);
         }
-        motion.count(&rule(), &replay);
-        assert_eq!(motion.bonus(), 0.0, "74 of 100");
+        count(&mut motion, &mut recent, &replay);
+        assert_eq!((motion.bonus(), motion.is_settled()), (0.0, true), "74 of 100");
     }
 
     #[test]
@@ -203,10 +191,10 @@ mod tests {
             (0..70).for_each(|number| episode(&mut replay, number, 0.5));
             (70..100).for_each(|number| episode(&mut replay, number, 0.3));
             let mut first = motion(0.0);
-            first.count(&rule(), &replay);
+            count(&mut first, &mut Recent::default(), &replay);
             (100..149).for_each(|number| episode(&mut replay, number, 0.5));
             let mut resumed = motion(0.0);
-            resumed.count(&rule(), &replay);
+            count(&mut resumed, &mut Recent::default(), &replay);
             assert_eq!(resumed, first);
             assert_eq!(
                 first.bonus() > 0.0,
@@ -220,24 +208,25 @@ mod tests {
     fn the_newest_segments_are_counted_when_the_ring_is_full() {
         let mut replay = Replay::new(LAYOUT, 400, 1, 1); // 200 slots
         (0..100).for_each(|number| episode(&mut replay, number, 0.5));
-        let mut motion = motion(0.0);
-        motion.count(&rule(), &replay);
+        let (mut motion, mut recent) = (motion(0.0), Recent::default());
+        count(&mut motion, &mut recent, &replay);
         assert_eq!(motion.bonus(), 0.0);
         (100..150).for_each(|number| episode(&mut replay, number, 0.3));
-        motion.count(&rule(), &replay);
+        count(&mut motion, &mut recent, &replay);
         assert_eq!(motion.bonus(), 2.0);
     }
 
     #[test]
-    fn the_share_of_windows_comes_from_episodes_that_moved_the_goal() {
+    fn the_share_of_windows_comes_from_episodes_that_moved_the_goal_within_the_region() {
         let mut replay = Replay::new(LAYOUT, 2_000, 1, 1);
         for number in 0..10 {
-            episode(&mut replay, number, if number == 3 { 0.5 } else { 0.0 });
+            let step = [0.0, 0.0, 20.0, 0.5, 0.0, 0.0, 20.0, 0.0, 0.0, 0.0][number as usize];
+            episode(&mut replay, number, step);
         }
         let random = dmprl_shared::seeds::stream(1, "test", 0);
         let mut sampler = Sampler::new(Windows::Sliding, random);
-        let motion = motion(0.5);
-        let mut draw = || motion.draw(&rule(), &replay, &mut sampler).unwrap();
+        let (motion, region) = (motion(0.5), region(&replay));
+        let mut draw = || motion.draw(&rule(), &region, &replay, &mut sampler).unwrap();
         let moved = (0..4_000).filter(|_| matches!(draw().slot, 6 | 7)).count();
         // Of half of the windows a tenth; of the other half 1 - 0.9^30. Five standard deviations.
         let expected = 4_000.0 * (0.05 + 0.5 * (1.0 - 0.9_f64.powi(30)));
@@ -245,12 +234,22 @@ mod tests {
     }
 
     #[test]
-    fn a_step_moves_the_goal_if_it_is_farther_than_a_part_of_the_threshold() {
+    fn a_step_moves_the_goal_if_it_is_farther_than_a_part_of_the_threshold_and_in_the_region() {
         let mut replay = Replay::new(LAYOUT, 20, 1, 1);
         episode(&mut replay, 0, 0.05);
-        let window = replay.window(0, 1).unwrap();
-        let moves = |step| motion(0.0).step_moves(&rule(), &replay, &window, step);
-        assert_eq!([moves(1), moves(2)], [true, false]);
+        episode(&mut replay, 1, 20.0);
+        let region = region(&replay);
+        let moves = |slot, step| {
+            let window = replay.window(slot, 1).unwrap();
+            motion(0.0).step_moves(&rule(), &region, &replay, &window, step)
+        };
+        assert_eq!([moves(0, 1), moves(0, 2), moves(2, 1)], [true, false, false]);
+    }
+
+    /// Returns the region of all segments: 0 to 9 and a threshold more.
+    fn region(replay: &Replay) -> Region {
+        let slots: Vec<u32> = (0..replay.len() as u32).collect();
+        Region::new(&rule(), replay, &slots)
     }
 
     #[test]

@@ -81,9 +81,10 @@ pub struct AlgorithmConfig {
     /// rewards. The action before the first one is read from the replay. Larger values give
     /// smoother motion.
     pub action_rate_penalty: f64,
-    /// Reward of a step that moves the achieved goal, in units of the reward of reaching a goal.
-    /// It is added while less than half of the recent episodes move it, if goals are drawn when a
-    /// batch is sampled and the reward is sparse.
+    /// Reward of a step that moves the achieved goal and leaves it in the region of desired goals
+    /// and starts, in units of the reward of reaching a goal. It is added while less than half of
+    /// the recent episodes move it, if goals are drawn when a batch is sampled and the reward is
+    /// sparse.
     pub motion_bonus: f64,
     /// Whether the critics of DDPG, TD3 and SAC also see how far from the desired goal a model
     /// expects the achieved goal after each step of the segment. The model learns from the same
@@ -105,13 +106,22 @@ pub struct Td3Config {
     pub target_noise_std: f64,
     /// Target noise is clipped to this absolute value, in units of u.
     pub target_noise_clip: f64,
+    /// Weight of the smaller of the two target critics; the larger one has the rest. 1 is TD3, 0.5
+    /// the mean. Where targets are clipped to the returns that a sparse reward allows,
+    /// overestimation is bounded, and the smaller value alone underestimates.
+    pub target_smaller_weight: f64,
     /// Critic updates per update of the actor and the targets.
     pub actor_interval: u64,
 }
 
 impl Default for Td3Config {
     fn default() -> Self {
-        Self { target_noise_std: 0.2, target_noise_clip: 0.5, actor_interval: 2 }
+        Self {
+            target_noise_std: 0.2,
+            target_noise_clip: 0.5,
+            target_smaller_weight: 1.0,
+            actor_interval: 2,
+        }
     }
 }
 
@@ -255,6 +265,10 @@ pub struct ExplorationConfig {
     /// full range, held over all steps of the segment. It moves objects that noise around the
     /// policy's actions does not.
     pub random_segments: f64,
+    /// Share of `std` and `random_segments` that remains while half of the recent episodes or more
+    /// move the achieved goal (as for `algorithm.motion_bonus`). Random actions find an object, and
+    /// are in the way of placing it.
+    pub settled_share: f64,
     /// Length of the warm-up, in which actions are random: environment steps of all workers
     /// together.
     pub warm_up_steps: u64,
@@ -270,6 +284,7 @@ impl Default for ExplorationConfig {
             kind: ExplorationKind::Gaussian,
             std: 0.1,
             random_segments: 0.0,
+            settled_share: 1.0,
             warm_up_steps: 3_000,
             warm_up_kind: WarmUpKind::Uniform,
             warm_up_range: 0.3,

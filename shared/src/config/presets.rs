@@ -57,10 +57,13 @@ discount = 0.98
 action_rate_penalty = 0.0
 motion_bonus = 1.0
 outcome_model = true
+[algorithm.td3]
+target_smaller_weight = 0.5
 [exploration]
 kind = "segment"
 std = 0.2
 random_segments = 0.3
+settled_share = 0.4
 warm_up_kind = "segment"
 warm_up_range = 1.0
 [replay]
@@ -114,6 +117,7 @@ outcome_model = false
 [algorithm.td3]
 target_noise_std = 0.2
 target_noise_clip = 0.5
+target_smaller_weight = 1.0
 actor_interval = 2
 [algorithm.sac]
 initial_temperature = 1.0
@@ -122,6 +126,7 @@ temperature_learning_rate = 0.0003
 kind = "gaussian"
 std = 0.1
 random_segments = 0.0
+settled_share = 1.0
 warm_up_steps = 10000
 warm_up_kind = "uniform"
 warm_up_range = 1.0
@@ -230,6 +235,7 @@ critic_hidden = [256, 256]
 action_rate_penalty = 0.0
 [exploration]
 random_segments = 0.0
+settled_share = 1.0
 warm_up_steps = 0
 [replay]
 hindsight = "none"

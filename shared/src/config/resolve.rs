@@ -232,6 +232,8 @@ impl ExperimentConfig {
             ("replay.hindsight_share", self.replay.hindsight_share),
             ("replay.moved_share", self.replay.moved_share),
             ("exploration.random_segments", random),
+            ("exploration.settled_share", self.exploration.settled_share),
+            ("algorithm.td3.target_smaller_weight", self.algorithm.td3.target_smaller_weight),
         ];
         for (key, got) in shares {
             range(key, got, (0.0..=1.0).contains(&got), || "from 0 to 1".into())?;
@@ -461,6 +463,8 @@ mod tests {
             ("replay.moved_share", "-0.1"),
             ("algorithm.motion_bonus", "-1"),
             ("exploration.random_segments", "-0.1"),
+            ("exploration.settled_share", "1.1"),
+            ("algorithm.td3.target_smaller_weight", "1.1"),
             ("actors.workers", "1000000"),
             ("actors.env_call_timeout_s", "0"),
             ("actors.env_call_timeout_s", "inf"),

@@ -37,6 +37,7 @@ fn stochastic_policy_keeps_its_standard_deviations() {
         version: 1,
         env_steps: 0,
         architecture_hash: own.architecture_hash(),
+        settled: false,
         values: own.initial_parameters(&mut random),
     };
     fs::write(&path, encode(&own, &snapshot, None, None).unwrap()).unwrap();
@@ -56,6 +57,7 @@ fn policy_survives_a_round_trip_and_other_or_corrupted_files_are_rejected() {
         version: 7,
         env_steps: 100,
         architecture_hash: own.architecture_hash(),
+        settled: false,
         values: own.initial_parameters(&mut random),
     };
     fs::write(&path, encode(&own, &snapshot, None, None).unwrap()).unwrap();
@@ -82,6 +84,7 @@ fn saved(keys: &[(&str, &str)], path: &Path) -> (Policy, ParameterSnapshot, Orig
         version: 3,
         env_steps: 100,
         architecture_hash: own.architecture_hash(),
+        settled: false,
         values: own.initial_parameters(&mut random),
     };
     let origin = Origin {

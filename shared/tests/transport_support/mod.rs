@@ -93,6 +93,7 @@ pub fn snapshot(version: u64) -> ParameterSnapshot {
         version,
         env_steps: version * 10,
         architecture_hash: ARCHITECTURE,
+        settled: version.is_multiple_of(2),
         values: vec![version as f32; PARAMETERS_LEN],
     }
 }

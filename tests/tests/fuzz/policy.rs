@@ -22,7 +22,8 @@ fn one_that_is_accepted_is_finite_and_stays_what_it_is() {
     let made = [1, 2].map(|version| {
         let values = policy.initial_parameters(&mut dmprl_shared::seeds::stream(version, "p", 0));
         let architecture_hash = policy.architecture_hash();
-        let snapshot = ParameterSnapshot { version, env_steps: 10, architecture_hash, values };
+        let snapshot =
+            ParameterSnapshot { version, env_steps: 10, architecture_hash, settled: false, values };
         let hold = (version == 2).then_some(&Hold::ZeroVelocity);
         policy_file::encode(&policy, &snapshot, None, hold).unwrap()
     });

@@ -56,6 +56,7 @@ pages! {
     every_block_of_the_first_page_runs: "docs/index.md",
     every_block_about_the_start_runs: "docs/start.md",
     every_block_about_a_task_of_ones_own_runs: "docs/own-task.md",
+    every_block_about_a_picked_cube_runs: "docs/picked-cube.md",
     every_block_about_commands_runs: "docs/commands.md",
     every_block_about_environments_runs: "docs/environments.md",
     every_block_about_demonstrations_runs: "docs/demonstrations.md",

@@ -155,8 +155,13 @@ fn learner(stage: &Stage, domain: PathBuf) {
                 version += 1;
                 let values = vec![version as f32; 1_000];
                 let architecture_hash = ARCHITECTURE;
-                let snapshot =
-                    ParameterSnapshot { version, env_steps: 1, architecture_hash, values };
+                let snapshot = ParameterSnapshot {
+                    version,
+                    env_steps: 1,
+                    architecture_hash,
+                    settled: false,
+                    values,
+                };
                 parameters.publish(&snapshot).unwrap();
                 acknowledgements.acknowledge(inbox.acknowledge().unwrap()).unwrap();
                 segments.maintain().unwrap();

@@ -107,6 +107,7 @@ fn opened(args: &PolicyArgs) -> anyhow::Result<OpenedPolicy> {
     let policy = Policy::new(&config, &task.spec())?;
     let values = policy.initial_parameters(&mut seeds::stream(config.run.seed, "policy", 0));
     let architecture_hash = policy.architecture_hash();
-    let snapshot = ParameterSnapshot { version: 0, env_steps: 0, architecture_hash, values };
+    let snapshot =
+        ParameterSnapshot { version: 0, env_steps: 0, architecture_hash, settled: false, values };
     Ok(OpenedPolicy { policy, snapshot, origin: None, hold: None })
 }

@@ -28,8 +28,8 @@ pub(super) struct WireHeader {
     env_steps: u64,
     architecture_hash: u64,
     checksum: u32,
-    /// Explicit padding, so that all bytes are initialised.
-    reserved: u32,
+    /// 1 if the snapshot is settled, else 0.
+    settled: u32,
 }
 
 const _: () = assert!(size_of::<WireHeader>() == 32 && align_of::<WireHeader>() == 8);
@@ -38,7 +38,14 @@ const _: () = assert!(size_of::<WireHeader>() == 32 && align_of::<WireHeader>() 
 // with the layout.
 unsafe impl ZeroCopySend for WireHeader {
     unsafe fn type_name() -> &'static str {
-        "dmprl::ParameterHeader1"
+        "dmprl::ParameterHeader2"
+    }
+}
+
+impl WireHeader {
+    /// Returns the fields that the checksum covers.
+    fn fields(&self) -> [u64; 4] {
+        [self.version, self.env_steps, self.architecture_hash, self.settled.into()]
     }
 }
 
@@ -98,7 +105,7 @@ impl ParameterPublisher for Publisher {
             env_steps: snapshot.env_steps,
             architecture_hash: snapshot.architecture_hash,
             checksum: snapshot.checksum(),
-            reserved: 0,
+            settled: snapshot.settled.into(),
         };
         // Written before publication, so that a restarted learner knows every published version.
         self.version_file
@@ -142,7 +149,7 @@ fn check(header: &WireHeader, values: &[f32], architecture_hash: u64) -> Result<
         return Err(SnapshotError::Architecture { version, expected, got });
     }
     let expected = header.checksum;
-    let got = checksum(version, header.env_steps, header.architecture_hash, values);
+    let got = checksum(header.fields(), values);
     if got != expected {
         return Err(SnapshotError::Checksum { version, expected, got });
     }
@@ -173,6 +180,7 @@ impl ParameterSubscriber for Subscriber {
             snapshot.version = header.version;
             snapshot.env_steps = header.env_steps;
             snapshot.architecture_hash = header.architecture_hash;
+            snapshot.settled = header.settled != 0;
             snapshot.values.clone_from(copied);
             replaced = true;
         }
@@ -208,6 +216,7 @@ mod tests {
             version: 1,
             env_steps: 10,
             architecture_hash: 2,
+            settled: true,
             values: vec![1.0, 2.0, 3.0],
         };
         learner.parameters.publish(&valid).unwrap();
@@ -217,8 +226,8 @@ mod tests {
             version: 2,
             env_steps: 20,
             architecture_hash: 2,
-            checksum: checksum(2, 20, 2, &[1.0, 2.0, 3.0]),
-            reserved: 0,
+            checksum: checksum([2, 20, 2, 1], &[1.0, 2.0, 3.0]),
+            settled: 1,
         };
         learner.parameters.writer.send(header, &[1.0, 2.0, 4.0]).unwrap();
         let error = subscriber.newest(&mut taken).unwrap_err();

@@ -176,7 +176,8 @@ impl Ingest {
             let values = vec![version as f32; PARAMETERS];
             let architecture_hash = plan(1).architecture_hash;
             let env_steps = self.taken;
-            let snapshot = ParameterSnapshot { version, env_steps, architecture_hash, values };
+            let snapshot =
+                ParameterSnapshot { version, env_steps, architecture_hash, settled: false, values };
             self.end.parameters.publish(&snapshot)?;
         }
         Ok(())

@@ -1,0 +1,43 @@
+//! The newest segments of the replay, read from time to time.
+
+use super::Replay;
+
+/// Number of newest segments that are read.
+const RECENT_SEGMENTS: u64 = 600;
+/// Inserted segments between two readings.
+const READ_EVERY: u64 = 100;
+
+/// When the newest segments are read next.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Recent {
+    /// Number of inserted segments for which a reading is due.
+    due: u64,
+}
+
+impl Recent {
+    /// Returns the slots of the newest segments, newest first, if a reading is due. They are
+    /// segments that a replay still has when the next reading is due, so a resumed run reads the
+    /// same ones.
+    pub(super) fn read(&mut self, replay: &Replay) -> Option<Vec<u32>> {
+        let inserted = replay.inserted - replay.inserted % READ_EVERY;
+        if inserted < self.due {
+            return None;
+        }
+        self.due = inserted + READ_EVERY;
+        let newest = replay.inserted - inserted;
+        let ring = (replay.slots.len() - replay.demonstrations) as u64;
+        let recent = RECENT_SEGMENTS.min(ring.saturating_sub(READ_EVERY)).min(inserted);
+        Some((newest..newest + recent).map_while(|back| replay.slot_before(back)).collect())
+    }
+}
+
+impl Replay {
+    /// Returns the slot of the segment that was inserted `back` segments before the newest, of
+    /// those that replace each other.
+    fn slot_before(&self, back: u64) -> Option<u32> {
+        let ring = self.slots.len() - self.demonstrations;
+        let position = self.head.checked_sub(self.demonstrations)? + 2 * ring;
+        let slot = self.demonstrations + position.checked_sub(1 + back as usize)? % ring;
+        (slot < self.filled).then_some(slot as u32)
+    }
+}
