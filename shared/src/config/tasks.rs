@@ -110,7 +110,7 @@ const PANDA_PUSH: TaskDefaults = TaskDefaults {
     name: "panda-push",
     id: "dmprl/PandaPush-v0",
     about: "Franka Panda pushes a cube to a goal, sparse reward",
-    observation_len: 24,
+    observation_len: 27,
     values: PANDA_PUSH_VALUES,
     paper: &[],
     ..PANDA_REACH
@@ -142,7 +142,7 @@ const PANDA_PICK_AND_PLACE: TaskDefaults = TaskDefaults {
     id: "dmprl/PandaPickAndPlace-v0",
     about: "Franka Panda brings a cube to a goal on or above the table, sparse reward",
     control: "gripper displacement, ±1 = 5 cm, and opening, ±1 = 20 cm per step",
-    observation_len: 26,
+    observation_len: 29,
     action_low: &[-1.0; 4],
     action_high: &[1.0; 4],
     values: PANDA_PICK_AND_PLACE_VALUES,
@@ -160,7 +160,7 @@ const PANDA_STACK: TaskDefaults = TaskDefaults {
     name: "panda-stack",
     id: "dmprl/PandaStack-v0",
     about: "Franka Panda stacks two cubes at a goal, sparse reward",
-    observation_len: 44,
+    observation_len: 50,
     episode_steps: 100,
     values: PANDA_STACK_VALUES,
     ..PANDA_PICK_AND_PLACE
