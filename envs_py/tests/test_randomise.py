@@ -156,7 +156,7 @@ class EnvironmentsTest(unittest.TestCase):
         self.assertIsNone(plain.batch.models)
         for drawn, nominal in zip(segments(env, 4), segments(plain, 4), strict=True):
             difference = drawn[0] - nominal[0]
-            heights = [2, 14]  # of the object, as a goal and in the observation
+            heights = [2, 14, 26]  # of the object, as a goal and twice in the observation
             self.assertTrue(np.all(np.abs(difference[:, heights]) < 0.3 * 0.02))
             self.assertTrue(np.all(np.delete(difference, heights, axis=1) == 0.0))
         first, second = (model.body_mass[-1] for model in env.batch.models)
