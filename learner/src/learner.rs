@@ -409,6 +409,7 @@ impl Learner {
 pub(crate) mod tests {
     use dmprl_shared::config::Hindsight;
     use dmprl_shared::goal_rule::{GoalReward, GoalRule, Norm};
+    use dmprl_shared::segment::{SegmentHeader, TRUNCATED};
 
     use super::*;
 
@@ -437,6 +438,30 @@ pub(crate) mod tests {
             norm: Norm::Euclidean,
             reward: GoalReward::Sparse { threshold: 0.5, reached: 0.0, missed: -1.0 },
             ends_within: None,
+        }
+    }
+
+    #[test]
+    fn a_snapshot_is_settled_if_half_of_the_recent_episodes_move_the_achieved_goal() {
+        let spec = EnvSpec { goal_rule: Some(goal_rule().into()), ..spec() };
+        let mut config = ExperimentConfig::default();
+        config.replay.hindsight = Hindsight::Future;
+        // Segments are counted by hundreds; each is an episode here.
+        for (moving, expected) in [(49, false), (50, true)] {
+            let mut learner = Learner::new(config.clone(), &spec, 1).unwrap();
+            let layout = learner.replay.layout();
+            for episode in 0..100 {
+                let mut block = vec![0.0; layout.block_len()];
+                // The achieved goal after the last step.
+                let last = layout.segment_steps * layout.observation_len;
+                block[last] = if episode < moving { 1.0 } else { 0.0 };
+                let steps_len = layout.segment_steps as u32;
+                let header =
+                    SegmentHeader { episode, steps_len, flags: TRUNCATED, ..Default::default() };
+                learner.replay.insert(&header, &block);
+            }
+            // No update has been made, as after a resume.
+            assert_eq!(learner.next_snapshot().unwrap().settled, expected, "{moving} of 100");
         }
     }
 

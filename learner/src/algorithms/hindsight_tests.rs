@@ -31,7 +31,7 @@ fn rule(ends_within: Option<f64>) -> GoalRule {
 
 /// An episode of three steps that achieves 1, 2 and 3, with the goal 9: r = -1, u = 0.1, 0.2, 0.3.
 fn replay(flag: u32) -> Replay {
-    let mut replay = Replay::new(LAYOUT, 400, 1, 1);
+    let mut replay = Replay::new(LAYOUT, 1_000, 1, 1);
     let whole = [0.0, 9.0, 1.0, 9.0, 2.0, 9.0, 0.1, 0.2, -1.0, -1.0];
     let rest = [2.0, 9.0, 3.0, 9.0, 0.0, 0.0, 0.3, 0.0, -1.0, 0.0];
     for (block, episode_step, steps_len, flags) in [(whole, 0, 2, 0), (rest, 2, 1, flag)] {

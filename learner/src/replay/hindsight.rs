@@ -151,8 +151,9 @@ impl GoalSampler {
             + usize::from(window.offset);
         let end = (live.last_rank - live.first_rank) as usize * steps_max
             + usize::from(replay.slots[live.newest as usize].steps_len);
+        let draws_max = if self.strategy == Hindsight::Final { 1 } else { DRAWS_MAX };
         let mut drawn = None;
-        for _ in 0..DRAWS_MAX {
+        for _ in 0..draws_max {
             let step = match self.strategy {
                 Hindsight::Final => end,
                 Hindsight::Episode => random.random_range(1..=end),

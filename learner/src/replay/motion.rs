@@ -19,7 +19,8 @@ use super::{Replay, Sampler, Window};
 const EPISODE_MOVES: f64 = 0.4;
 /// A step moves the achieved goal if it does so by more than this many thresholds.
 const STEP_MOVES: f64 = 0.04;
-/// Share of the recent episodes below which steps get a bonus.
+/// Share of the recent episodes below which steps get a bonus, and from which on workers explore
+/// less.
 const RARE: f64 = 0.5;
 /// Draws after which a window is taken from any episode.
 const DRAWS_MAX: usize = 30;
@@ -38,12 +39,11 @@ pub(super) struct Motion {
 
 impl Motion {
     /// Makes the remedies for a rule. `factor` is the bonus, in units of the difference between a
-    /// reached goal's reward and a missed one's. Returns `None` if both are off or the reward is
-    /// dense.
+    /// reached goal's reward and a missed one's. Returns `None` if the reward is dense.
     pub(super) fn new(rule: &GoalRule, share: f64, factor: f64) -> Option<Self> {
         let GoalReward::Sparse { threshold, reached, missed } = rule.reward else { return None };
         let bonus = (factor * (reached - missed)) as f32;
-        (share > 0.0 || factor > 0.0).then_some(Self { threshold, share, bonus, moving: None })
+        Some(Self { threshold, share, bonus, moving: None })
     }
 
     /// Counts the episodes that end in one of the recent `slots`.
@@ -253,9 +253,8 @@ mod tests {
     }
 
     #[test]
-    fn dense_rewards_have_no_threshold_and_no_remedies() {
+    fn dense_rewards_have_no_threshold() {
         let dense = GoalRule { reward: GoalReward::Dense { factor: -1.0 }, ..rule() };
         assert_eq!(Motion::new(&dense, 0.5, 1.0), None);
-        assert_eq!(Motion::new(&rule(), 0.0, 0.0), None);
     }
 }

@@ -26,7 +26,10 @@ impl Recent {
         self.due = inserted + READ_EVERY;
         let newest = replay.inserted - inserted;
         let ring = (replay.slots.len() - replay.demonstrations) as u64;
-        let recent = RECENT_SEGMENTS.min(ring.saturating_sub(READ_EVERY)).min(inserted);
+        // Of each environment's episode the start may have been replaced. Its oldest segment is
+        // left out, because a replay that is read from a file takes it for the start.
+        let kept = ring.saturating_sub(READ_EVERY + replay.tails.len() as u64);
+        let recent = RECENT_SEGMENTS.min(kept).min(inserted);
         Some((newest..newest + recent).map_while(|back| replay.slot_before(back)).collect())
     }
 }
