@@ -1,5 +1,7 @@
 //! Sizes, bounds and timing of an environment.
 
+use std::fmt::Debug;
+
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -123,17 +125,26 @@ impl EnvSpec {
         Ok(())
     }
 
-    /// Whether both describe the same environment. Names of observation entries are ignored if only
-    /// one side has them. Goal rules are ignored, because only runs with hindsight look for one.
+    /// Returns the fields in which `got` differs, or `None` if both describe the same environment.
+    /// Names of observation entries are ignored if only one side has them, or a different length
+    /// says enough. Goal rules are ignored, because only runs with hindsight look for one.
     #[must_use]
-    pub fn is_same(&self, other: &Self) -> bool {
-        let named = !self.observation_names.is_empty() && !other.observation_names.is_empty();
-        if named && self.observation_names != other.observation_names {
-            return false;
-        }
-        let plain =
-            |spec: &Self| Self { observation_names: Vec::new(), goal_rule: None, ..spec.clone() };
-        plain(self) == plain(other)
+    pub fn difference(&self, got: &Self) -> Option<String> {
+        let names = self.observation_names.iter().zip(&got.observation_names);
+        let renamed = names.enumerate().find(|(_, (expected, got))| expected != got);
+        let renamed = renamed.filter(|_| self.observation_len == got.observation_len);
+        let fields = [
+            field("id", &self.id, &got.id),
+            field("observation_len", &self.observation_len, &got.observation_len),
+            renamed.and_then(|(at, (a, b))| field(&format!("observation_names[{at}]"), a, b)),
+            field("action_len", &self.action_len, &got.action_len),
+            field("action_low", &self.action_low, &got.action_low),
+            field("action_high", &self.action_high, &got.action_high),
+            field("control_dt_s", &self.control_dt_s, &got.control_dt_s),
+            field("episode_steps", &self.episode_steps, &got.episode_steps),
+        ];
+        let differing: Vec<String> = fields.into_iter().flatten().collect();
+        (!differing.is_empty()).then(|| differing.join("; "))
     }
 
     /// Returns the name of entry `index` of an observation, `observation[index]` if it has none.
@@ -142,6 +153,11 @@ impl EnvSpec {
         let name = self.observation_names.get(index).cloned();
         name.unwrap_or_else(|| format!("observation[{index}]"))
     }
+}
+
+/// Returns `name: expected …, got …` if the values differ.
+fn field<T: PartialEq + Debug>(name: &str, expected: &T, got: &T) -> Option<String> {
+    (expected != got).then(|| format!("{name}: expected {expected:?}, got {got:?}"))
 }
 
 #[cfg(test)]
@@ -161,10 +177,12 @@ mod tests {
         let newer = EnvSpec { observation_names: names, ..older.clone() };
         newer.check().unwrap();
         assert_eq!(newer.observation_name(1), "speed");
-        assert!(newer.is_same(&older) && older.is_same(&newer));
+        assert_eq!((newer.difference(&older), older.difference(&newer)), (None, None));
         let other = EnvSpec { observation_names: vec!["x".into(), "y".into()], ..older.clone() };
-        assert!(!newer.is_same(&other));
-        assert!(!older.is_same(&EnvSpec { episode_steps: 51, ..older.clone() }));
+        assert!(newer.difference(&other).unwrap().starts_with("observation_names["));
+        let other = EnvSpec { episode_steps: 51, control_dt_s: 0.5, ..older.clone() };
+        let expected = "control_dt_s: expected 0.02, got 0.5; episode_steps: expected 50, got 51";
+        assert_eq!(older.difference(&other).unwrap(), expected);
     }
 
     #[test]

@@ -277,5 +277,8 @@ fn a_resumed_run_with_a_changed_environment_fails() {
     fixture.run.write_spec(&spec).unwrap();
     let (report, _) = fixture.supervise();
     let message = failure(report.ending);
-    assert!(message.contains("differs from the run's"), "{message}");
+    assert!(
+        message.contains("differs from the run's: observation_len: expected 3, got"),
+        "{message}"
+    );
 }

@@ -114,18 +114,17 @@ impl Machine {
     }
 
     fn on_environment(&mut self, process: Process, spec: EnvSpec) -> Result<(), Failure> {
+        let difference = self.spec.as_ref().and_then(|known| known.difference(&spec));
+        if let Some(difference) = difference {
+            return Err(Failure::new(format!(
+                "the environment of {process} differs from the run's: {difference}. Use the \
+                 environment's version that the run began with, or start a new run"
+            )));
+        }
         match &self.spec {
             None => {
                 self.actions.push(Action::WriteSpec(spec.clone()));
                 self.spec = Some(spec);
-            }
-            Some(known) if !known.is_same(&spec) => {
-                let json = |spec| serde_json::to_string(spec).unwrap_or_default();
-                return Err(Failure::new(format!(
-                    "the environment of {process} differs from the run's: expected {}, got {}",
-                    json(known),
-                    json(&spec)
-                )));
             }
             // A run of an older version that is resumed has no goal rule yet.
             Some(known) if known.goal_rule.is_none() && spec.goal_rule.is_some() => {
