@@ -18,12 +18,12 @@ from types import MappingProxyType
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.envs import registration
 from numpy.typing import NDArray
 
 from dmprl import robotics_repair
 from dmprl.env_options import NO_OPTIONS, EnvOptions
+from dmprl.flat_spaces import flattened
 from dmprl.goal_rule import GoalRule
 from dmprl.hindsight import GymnasiumGoals
 from dmprl.observation_names import names_of
@@ -38,14 +38,8 @@ from dmprl.segment_env import (
     SegmentBuffers,
     SegmentEnv,
     SegmentEnvError,
-    UnsupportedSpaceError,
     named_object,
     seed_after_failure,
-)
-
-SUPPORTED_SPACES = (
-    "supported are a Box observation with one dimension (or a Dict or Tuple that Gymnasium can "
-    "flatten), and a bounded Box action with one dimension and a floating-point type"
 )
 
 FAILURES_KEPT_MAX = 10_000
@@ -120,6 +114,12 @@ class GymnasiumSegmentEnv(SegmentEnv):
             env.close()
         registered = copy.copy(registered)
         registered.order_enforce = False
+        if isinstance(registered.entry_point, str):
+            registration.load_env_creator(registered.entry_point)  # imports its module
+        if "mujoco" in sys.modules:
+            from dmprl import mujoco_warnings
+
+            mujoco_warnings.to_standard_error()
         return registered
 
     def _make_unregistered(self) -> gymnasium.Env:
@@ -128,7 +128,10 @@ class GymnasiumSegmentEnv(SegmentEnv):
         except gymnasium.error.UnregisteredEnv as error:
             module, _, name = self.task_id.rpartition(":")
             if not module:
-                raise
+                raise gymnasium.error.NameNotFound(
+                    f"{error} If a package registers it, name the package: PACKAGE:{name}, such as "
+                    "gymnasium_robotics:FetchPush-v4 after `dmprl env add gymnasium-robotics`"
+                ) from None
             raise gymnasium.error.NameNotFound(
                 f"{self.task_id}: the module {module} exists, but has no class or function {name} "
                 f"and registers no environment with that name ({error})"
@@ -143,26 +146,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
 
             env = randomised_env(env, self.options.randomise)
         env = wrapped(env, self.options.wrappers)
-        observation, action = env.observation_space, env.action_space
-        self._observation_space = observation
-        if isinstance(observation, spaces.Dict | spaces.Tuple) and observation.is_np_flattenable:
-            # The entries of a Dict are in the order of its space, which Gymnasium sorts by key.
-            env = gymnasium.wrappers.FlattenObservation(env)
-            observation = env.observation_space
-        if not isinstance(observation, spaces.Box) or len(observation.shape) != 1:
-            raise UnsupportedSpaceError(
-                f"{self.task_id}: observation space {observation}; {SUPPORTED_SPACES}"
-            )
-        if (
-            not isinstance(action, spaces.Box)
-            or len(action.shape) != 1
-            or not np.issubdtype(action.dtype, np.floating)
-            or not action.is_bounded("both")
-        ):
-            raise UnsupportedSpaceError(
-                f"{self.task_id}: action space {action}; {SUPPORTED_SPACES}"
-            )
-        return env
+        self._observation_space = env.observation_space
+        return flattened(env, self.task_id)
 
     def spec(self) -> EnvSpec:  # noqa: D102 - inherited
         env = self._envs[0]

@@ -224,6 +224,15 @@ class SpecTest(unittest.TestCase):
         env.step_segment(np.zeros((1, 1, 1)), out)
         self.assertEqual(out.next_observations.tolist(), [[0.25, 0.25, 0, 1, 1, 1, 0.5]])
 
+    def test_spaces_of_several_dimensions_are_flattened(self):
+        env, out = started("tiny_envs:Grid-v0", segment_steps=1)
+        spec = env.spec()
+        self.assertEqual(spec["observation_names"][1], "observation[0,1]")
+        self.assertEqual((spec["action_low"], spec["action_len"]), ([-1.0, -2.0, -3.0, -4.0], 4))
+        env.step_segment(np.array([[[0.1, 0.2, 0.3, 0.4]]]), out)
+        self.assertEqual(out.next_observations[0, :2].tolist(), [1.0, 1.0])
+        self.assertEqual(out.rewards[0, 0], 0.4)
+
     def test_observations_of_any_number_type(self):
         for dtype in ("int8", "uint16", "int64", "float16", "float32"):
             with self.subTest(dtype):
@@ -247,15 +256,19 @@ class SpecTest(unittest.TestCase):
         for name, space in [
             ("Discrete", r"action space Discrete\(3\)"),
             ("Unbounded", r"action space Box\(-inf, inf, \(2,\), float32\)"),
-            ("Image", r"observation space Box\(0, 255, \(8, 8, 3\), uint8\)"),
+            ("Image", r"the observation, Box\(0, 255, \(8, 8, 3\), uint8\), is an image"),
+            ("Camera", r"observation\['front'\], Box\(0, 255, \(8, 8\), uint8\), is an image"),
+            ("Words", r"observation space Text\(1, 9,"),
         ]:
             with self.subTest(name), self.assertRaisesRegex(UnsupportedSpaceError, space) as raised:
                 make(f"tiny_envs:{name}-v0", 1, 5)
-            self.assertIn("supported are a Box", str(raised.exception))
+            self.assertIn("supported are Box", str(raised.exception))
 
     def test_unknown_names_are_rejected_with_advice(self):
         with self.assertRaisesRegex(gymnasium.error.Error, "Reacher"):
             make("Reachr-v5", 1, 5)
+        with self.assertRaisesRegex(gymnasium.error.Error, "PACKAGE:FetchPush-v4, such as"):
+            make("FetchPush-v4", 1, 5)
         with self.assertRaisesRegex(ModuleNotFoundError, "--python-path"):
             make("no_such_module:Task-v0", 1, 5)
         with self.assertRaisesRegex(gymnasium.error.Error, "the module tiny_envs exists, but"):

@@ -199,6 +199,21 @@ class Spaces(Countdown):
         self.action_space = action or ACTION
 
 
+class Grid(Countdown):
+    """Observes [[steps, steps], [draw, draw]]; the reward is the last entry of a (2, 2) action."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2, 2), np.float64)
+    action_space = spaces.Box(np.array([[-1, -2], [-3, -4]]), np.ones((2, 2)), dtype=np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        return np.stack([observation] * 2, 1), info
+
+    def step(self, action):
+        observation, *rest = super().step(action[1, 1:])
+        return np.stack([observation] * 2, 1), *rest
+
+
 class Typed(Countdown):
     """Observes numbers of a given type."""
 
@@ -438,6 +453,7 @@ for kind in ("hang", "hang-with-lock", "segfault"):
 register("Hopeless", Faulty, kwargs={"fault": "raise", "failing_step": 1}, max_episode_steps=7)
 register("FaultyReset", FaultyReset)
 register("Nested", Nested)
+register("Grid", Grid)
 for dtype in ("int8", "uint16", "int64", "float16", "float32"):
     register(f"Typed-{dtype}", Typed, kwargs={"dtype": dtype})
 register("Goal", Goal)
@@ -460,3 +476,6 @@ register("ReachTwisted", ReachTwisted, max_episode_steps=12)
 register("Discrete", Spaces, kwargs={"action": spaces.Discrete(3)})
 register("Unbounded", Spaces, kwargs={"action": spaces.Box(-np.inf, np.inf, (2,))})
 register("Image", Spaces, kwargs={"observation": spaces.Box(0, 255, (8, 8, 3), np.uint8)})
+CAMERA = spaces.Tuple((ACTION, spaces.Dict(front=spaces.Box(0, 255, (8, 8), np.uint8))))
+register("Camera", Spaces, kwargs={"observation": CAMERA})
+register("Words", Spaces, kwargs={"observation": spaces.Text(9)})

@@ -1,0 +1,54 @@
+"""Makes observations and actions of a Gymnasium environment one-dimensional."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from dmprl.segment_env import UnsupportedSpaceError
+
+SUPPORTED = (
+    "supported are Box observations, also in a Dict or Tuple, that are no images, and a bounded "
+    "Box action with a floating-point type; each is flattened"
+)
+
+
+def flattened(env: gymnasium.Env, task_id: str) -> gymnasium.Env:
+    """Wraps ``env`` so that each of its spaces is a Box with one dimension.
+
+    :raises UnsupportedSpaceError: for images, and for spaces that are neither Box nor made of
+        several; the message names the entry.
+    """
+    observation, action = env.observation_space, env.action_space
+    image = image_in(observation)
+    if image is not None:
+        raise UnsupportedSpaceError(f"{task_id}: {image} is an image; {SUPPORTED}")
+    supported = isinstance(observation, spaces.Box | spaces.Dict | spaces.Tuple)
+    if not supported or not observation.is_np_flattenable:
+        raise UnsupportedSpaceError(f"{task_id}: observation space {observation}; {SUPPORTED}")
+    if not isinstance(observation, spaces.Box) or len(observation.shape) != 1:
+        # The entries of a Dict are in the order of its space, which Gymnasium sorts by key.
+        env = gymnasium.wrappers.FlattenObservation(env)
+    if (
+        not isinstance(action, spaces.Box)
+        or not np.issubdtype(action.dtype, np.floating)
+        or not action.is_bounded("both")
+    ):
+        raise UnsupportedSpaceError(f"{task_id}: action space {action}; {SUPPORTED}")
+    if len(action.shape) != 1:
+        flat = spaces.Box(action.low.ravel(), action.high.ravel(), dtype=action.dtype)
+        env = gymnasium.wrappers.TransformAction(env, lambda u: u.reshape(action.shape), flat)
+    return env
+
+
+def image_in(space: spaces.Space, name: str = "the observation") -> str | None:
+    """Returns the name and the space of the first image in ``space``, if there is one."""
+    if isinstance(space, spaces.Dict):
+        entries = [(f"observation[{key!r}]", entry) for key, entry in space.items()]
+    elif isinstance(space, spaces.Tuple):
+        entries = [(f"observation[{index}]", entry) for index, entry in enumerate(space)]
+    else:
+        is_image = isinstance(space, spaces.Box) and space.dtype == np.uint8
+        return f"{name}, {space}," if is_image and len(space.shape) in (2, 3) else None
+    return next(filter(None, (image_in(entry, name) for name, entry in entries)), None)
