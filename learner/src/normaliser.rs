@@ -19,6 +19,12 @@ use crate::update::network::TrainableNetwork;
 /// Minimum standard deviation of a dimension that is scaled. Dividing by a smaller one would
 /// magnify the first deviation.
 const SCALE_MIN: f64 = 1e-4;
+/// Largest normalised value with goals, as in Andrychowicz et al. 2017, who clip to it. A strike
+/// gives an object that mostly lies still 20 to 50 standard deviations of velocity. Clipping would
+/// not be linear and could not be folded, so the scale of such an entry is larger instead.
+const NORMALISED_MAX: f64 = 5.0;
+/// Limit of that enlargement, so that one object that falls far does not hide small motions.
+const ENLARGED_MAX: f64 = 4.0;
 
 /// The place of the goals in an observation. Networks get the desired goal minus the achieved one
 /// instead of the desired goal: whether a goal is reached depends on a difference that is small
@@ -68,6 +74,9 @@ pub struct Normaliser {
     seen_mean: Vec<f64>,
     /// Sum of squared differences from the mean (Welford 1962).
     seen_squares: Vec<f64>,
+    /// Largest distance from the mean at its time. Absent in checkpoints from before 2026-11-26.
+    #[serde(default)]
+    seen_farthest: Vec<f64>,
     /// Number of observations at which mean and scale are updated.
     refresh_at: u64,
 }
@@ -83,6 +92,7 @@ impl Normaliser {
             count: 0,
             seen_mean: vec![0.0; observation_len],
             seen_squares: vec![0.0; observation_len],
+            seen_farthest: vec![0.0; observation_len],
             refresh_at: first.max(1),
         }
     }
@@ -105,6 +115,7 @@ impl Normaliser {
             && seen.iter().all(|part| part.len() == len)
             && seen.into_iter().flatten().all(|value| value.is_finite())
             && self.seen_squares.iter().all(|&squares| squares >= 0.0)
+            && self.seen_farthest.iter().all(|&farthest| farthest >= 0.0 && farthest.is_finite())
             && self.mean.iter().all(|mean| mean.is_finite())
             && self.scale.iter().all(|&scale| scale.is_finite() && scale > 0.0)
             && self.count.checked_mul(4).is_some()
@@ -136,8 +147,10 @@ impl Normaliser {
     fn observe_row(&mut self, value: impl Fn(usize) -> f32) {
         self.count += 1;
         let share = 1.0 / self.count as f64;
+        self.seen_farthest.resize(self.mean.len(), 0.0);
         let seen = self.seen_mean.iter_mut().zip(&mut self.seen_squares);
-        for (index, (mean, squares)) in seen.enumerate() {
+        let seen = seen.zip(&mut self.seen_farthest);
+        for (index, ((mean, squares), farthest)) in seen.enumerate() {
             let value = match self.relative.and_then(|goal| goal.achieved_for(index)) {
                 Some(achieved) => value(index) - value(achieved),
                 None => value(index),
@@ -146,6 +159,7 @@ impl Normaliser {
             let before = value - *mean;
             *mean += before * share;
             *squares += before * (value - *mean);
+            *farthest = farthest.max((value - *mean).abs());
         }
     }
 
@@ -183,12 +197,20 @@ impl Normaliser {
     pub fn update(&mut self) -> NormalisationChange<'static> {
         self.refresh_at = 2 * self.count.max(1);
         let before = self.mean_and_scale();
-        for (index, squares) in self.seen_squares.iter().enumerate() {
-            let scale = (squares / self.count.max(1) as f64).sqrt();
+        for index in 0..self.mean.len() {
+            let scale = self.seen_scale(index);
             self.mean[index] = self.seen_mean[index] as f32;
             self.scale[index] = if scale < SCALE_MIN { 1.0 } else { scale as f32 };
         }
         NormalisationChange { before, after: Some(self.mean_and_scale()) }
+    }
+
+    /// Returns the standard deviation of an entry, enlarged with goals if values are far out.
+    fn seen_scale(&self, index: usize) -> f64 {
+        let std = (self.seen_squares[index] / self.count.max(1) as f64).sqrt();
+        let farthest = self.seen_farthest.get(index).filter(|_| self.relative.is_some());
+        let enlarged = farthest.map_or(std, |farthest| farthest / NORMALISED_MAX);
+        enlarged.clamp(std, ENLARGED_MAX * std)
     }
 
     fn mean_and_scale(&self) -> [Cow<'static, [f32]>; 2] {
@@ -334,6 +356,30 @@ mod tests {
         normaliser.update();
         normaliser.apply_row(&[1.0, 9.0], &mut out);
         assert_eq!(out, [-1.0, 1.0]);
+    }
+
+    #[test]
+    fn rare_values_far_out_enlarge_the_scale_with_goals() {
+        // The last entry is 0 in 99 of 100 observations: mean 0.1, standard deviation sqrt(0.99).
+        let rows: Vec<f32> = (0..100).flat_map(|row| [0.0, 0.0, row as f32 / 10.0]).collect();
+        let rare: Vec<f32> = rows
+            .chunks_exact(3)
+            .flat_map(|row| [0.0, 0.0, f32::from(row[2] == 9.9) * 10.0])
+            .collect();
+        let scaled = |relative, rows: &[f32]| {
+            let mut normaliser = Normaliser::new(3, 1, relative);
+            normaliser.observe(rows);
+            normaliser.update();
+            let mut out = [0.0; 3];
+            normaliser.apply_row(&[0.0, 0.0, 10.1], &mut out);
+            out[2]
+        };
+        let goals = Some(RelativeGoal::new(&goal_rule()));
+        let std = 0.99_f32.sqrt();
+        assert_close(&[scaled(None, &rare)], &[10.0 / std]);
+        // The rare value was 9.9 from the mean, so 9.9 becomes 5.
+        assert_close(&[scaled(goals, &rare)], &[10.0 / 9.9 * 5.0]);
+        assert_close(&[scaled(goals, &rows)], &[scaled(None, &rows)]);
     }
 
     #[test]
