@@ -26,6 +26,7 @@ The rollout worker (Rust, ``actors/src/python_env``) embeds Python and calls
 
 from typing import TYPE_CHECKING, Any
 
+from dmprl.callbacks import Callback
 from dmprl.hold import Hold, NoHoldError
 from dmprl.policy import Policy
 from dmprl.policy_file import PolicyFileError
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     import gymnasium
 
 __all__ = [
+    "Callback",
     "Hold",
     "NoHoldError",
     "Policy",

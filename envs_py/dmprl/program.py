@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import ctypes
 import json
 import shutil
@@ -10,6 +11,8 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,6 +20,8 @@ INTERRUPTED = 130
 """Exit status of a program that saved after an interrupt."""
 LAST_LINES = 20
 """Number of output lines in an error message."""
+POLL_S = 0.2
+"""Time between two calls of ``watch`` [s]."""
 STOP_S = 30.0
 """Time limit for the last checkpoint if an exception other than an interrupt ends the call [s]."""
 PARENT_DEATH_SIGNAL = 1
@@ -32,7 +37,11 @@ class ProgramError(RuntimeError):
 
 
 def call(
-    command: str, *arguments: str, quiet: bool = False, error: type[ProgramError] = ProgramError
+    command: str,
+    *arguments: str,
+    quiet: bool = False,
+    error: type[ProgramError] = ProgramError,
+    watch: Callable[[], bool] | None = None,
 ) -> str:
     """Runs a command of the program and returns its standard output.
 
@@ -40,15 +49,18 @@ def call(
     ``quiet`` suppresses it.
 
     :param error: the exception to raise on failure.
+    :param watch: called regularly while the program runs; after False it is interrupted, and the
+        call returns as if it had ended by itself.
     :raises ProgramError: if it failed.
     :raises KeyboardInterrupt: if it was interrupted.
     :raises FileNotFoundError: if the program is not installed.
     """
     with tempfile.TemporaryFile() as printed:
-        status, output = _run([str(find()), command, *arguments], quiet, printed)
-        if status == INTERRUPTED:
+        words = [str(find()), command, *arguments]
+        status, output, stopped = _run(words, quiet, printed, watch or (lambda: True))
+        if status == INTERRUPTED and not stopped:
             raise KeyboardInterrupt
-        if status != 0:
+        if status not in (0, INTERRUPTED):
             raise error(command, status, output)
         printed.seek(0)
         return printed.read().decode()
@@ -99,8 +111,10 @@ def find() -> Path:
     )
 
 
-def _run(command: list[str], quiet: bool, printed: IO[bytes]) -> tuple[int, str]:
-    """Runs the program; returns its exit status and the last lines of its log."""
+def _run(
+    command: list[str], quiet: bool, printed: IO[bytes], watch: Callable[[], bool]
+) -> tuple[int, str, bool]:
+    """Runs the program; returns its exit status, its last lines, and whether ``watch`` ended it."""
     # In a terminal the program draws its own progress; a notebook shows its lines.
     live = not quiet and sys.stderr.isatty()
     child = subprocess.Popen(
@@ -115,29 +129,40 @@ def _run(command: list[str], quiet: bool, printed: IO[bytes]) -> tuple[int, str]
         preexec_fn=_end_with_parent,
     )
     last: collections.deque[str] = collections.deque(maxlen=LAST_LINES)
+    reader = threading.Thread(target=_read, args=(child, last, quiet), daemon=True)
+    reader.start()
+    stopped = interrupted = False
     try:
-        while True:
+        while child.poll() is None:
             try:
-                for line in child.stderr or ():
-                    last.append(line)
-                    if not quiet:
-                        print(line, end="", file=sys.stderr)
-                status = child.wait()
-                return status, "see its output above" if live else "".join(last)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    child.wait(POLL_S)
+                if not stopped and not watch():
+                    stopped = True
+                    child.send_signal(signal.SIGINT)
             except KeyboardInterrupt:
+                interrupted = True
                 child.send_signal(signal.SIGINT)
+        reader.join()
+        output = "see its output above" if live else "".join(last)
+        return child.returncode, output, stopped and not interrupted
     finally:
         # After any other exception, training must not continue unnoticed.
         if child.poll() is None:
             _stop(child)
 
 
+def _read(child: subprocess.Popen[str], last: collections.deque[str], quiet: bool) -> None:
+    """Reads the program's log, so that its pipe does not fill, and prints it unless ``quiet``."""
+    for line in child.stderr or ():
+        last.append(line)
+        if not quiet:
+            print(line, end="", file=sys.stderr)
+
+
 def _stop(child: subprocess.Popen[str]) -> None:
     """Interrupts the program, which then writes a checkpoint; kills it after a time limit."""
     child.send_signal(signal.SIGINT)
-    if child.stderr is not None:
-        # Otherwise the program could block on a full pipe.
-        child.stderr.close()
     try:
         child.wait(STOP_S)
     except subprocess.TimeoutExpired:

@@ -107,7 +107,7 @@ class Run:
 def _frame(rows: list[dict[str, Any]], library: str) -> Any:
     if library not in LIBRARIES:
         raise ValueError(f"library {library!r}: expected one of {', '.join(LIBRARIES)}")
-    flat = [_flat(row) for row in rows]
+    flat = [flat_row(row) for row in rows]
     try:
         if library == "pandas":
             import pandas
@@ -121,11 +121,12 @@ def _frame(rows: list[dict[str, Any]], library: str) -> Any:
         raise ImportError(f"{error}; dmprl env add {library}") from error
 
 
-def _flat(row: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat_row(row: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns the row with the keys of nested objects as ``object/key``."""
     flat: dict[str, Any] = {}
     for key, value in row.items():
         if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{key}/")
+            flat |= flat_row(value, f"{prefix}{key}/")
         else:
             flat[prefix + key] = value
     return flat

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from dmprl import program
+from dmprl.callbacks import Callback, Watch
 from dmprl.run import Run
 
 NAME_MAX = 60
@@ -26,6 +27,7 @@ def train(
     env_kwargs: Mapping[str, Any] | None = None,
     deterministic: bool = False,
     quiet: bool = False,
+    callbacks: Sequence[Callback] = (),
     **overrides: Any,
 ) -> Run:
     """Trains a policy and returns its run; an interrupt stops it with a checkpoint.
@@ -36,6 +38,8 @@ def train(
     :param deterministic: runs one worker in the learner's process and in lock-step with it, so that
         the same seed gives bit-identical results.
     :param quiet: suppresses progress.
+    :param callbacks: called after evaluations, metrics and checkpoints, and at the end; they may
+        stop the training, which then returns the run as if it had ended by itself.
     :param env_kwargs: arguments of the environment and of ``gymnasium.make``.
     :param overrides: flags of ``dmprl train`` (``steps=20_000``, ``algo="sac"``, ``seed=2``) and
         configuration keys with two underscores for the dot (``algorithm__batch_size=64``). A flag
@@ -52,7 +56,13 @@ def train(
         arguments += ["--python-path", str(python_path)]
     if deterministic:
         arguments.append("--deterministic")
-    program.call("train", *arguments, quiet=quiet, error=TrainingError)
+    watch = Watch(directory, callbacks)
+    try:
+        program.call("train", *arguments, quiet=quiet, error=TrainingError, watch=watch.poll)
+    except KeyboardInterrupt:
+        watch.end()
+        raise
+    watch.end()
     return Run(directory)
 
 

@@ -115,6 +115,38 @@ except TimeoutError as error:
 }
 
 #[test]
+fn callbacks_see_a_run_and_stop_it_with_a_checkpoint() {
+    let place = Workplace::new();
+    let script = "
+import json
+class Told(dmprl.Callback):
+    def __init__(self): self.evaluations, self.metrics, self.checkpoints, self.ends = [], [], [], 0
+    def on_evaluation(self, run, row):
+        self.evaluations.append(row['env_steps'])
+        return len(self.evaluations) < 4
+    def on_metrics(self, run, row): self.metrics.append(row['delivery/received'])
+    def on_checkpoint(self, run, path): self.checkpoints.append(path)
+    def on_end(self, run): self.ends += 1
+told = Told()
+run = dmprl.train('reacher', run_dir='mine', steps=10**9, quiet=True, callbacks=[told], **SMALL)
+seen = [row['env_steps'] for row in map(json.loads, open('mine/evaluations.jsonl'))]
+assert told.evaluations == seen and len(seen) >= 4, (told.evaluations, seen)
+assert told.metrics == sorted(told.metrics) and told.metrics[-1] > 0
+assert told.checkpoints[-1] == (run.path / 'checkpoints/latest').resolve()
+assert told.ends == 1
+class Failing(dmprl.Callback):
+    def on_checkpoint(self, run, path): raise LookupError('no space for', path.name)
+try:
+    dmprl.train('reacher', run_dir='other', steps=10**9, quiet=True, callbacks=[Failing()], **SMALL)
+except LookupError as error:
+    print(error)
+";
+    let printed = python(&place, script).with_status(0).printed;
+    assert!(printed.contains("no space for"), "{printed}");
+    place.until_no_process();
+}
+
+#[test]
 fn every_task_has_its_short_name_in_python_too() {
     let place = Workplace::new();
     let script = "import json; print(json.dumps(dmprl.SHORT_NAMES))";
