@@ -51,6 +51,20 @@ fn last_returns(run: &str) -> Vec<f64> {
 }
 
 #[test]
+fn the_module_of_a_project_in_the_current_folder_needs_no_python_path() {
+    let place = Workplace::new();
+    fs::create_dir_all(place.path("src/lab")).unwrap();
+    fs::write(place.path("src/lab/plain.py"), PLAIN).unwrap();
+    fs::write(place.path("pyproject.toml"), "[project]\nname = 'lab'\n").unwrap();
+    let run = place.path("run");
+    place
+        .run(&train("lab.plain:Plain", &run, &["--steps", "400"]))
+        .with_status(0)
+        .saying(&format!("modules from {}", place.path("src")));
+    assert_eq!(last_returns(&run), [20.0; 4]);
+}
+
+#[test]
 fn arguments_and_wrappers_are_those_of_training_evaluation_and_resume() {
     let place = workplace();
     let (run, folder) = (place.path("run"), place.path(""));

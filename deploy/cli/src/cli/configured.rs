@@ -1,6 +1,6 @@
 //! Arguments that determine the configuration, shared by `train` and the benchmarks.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
@@ -34,7 +34,8 @@ pub(super) struct ConfiguredArgs {
     /// Seed of all random streams.
     #[arg(long, value_name = "S", value_parser = integer())]
     seed: Option<i64>,
-    /// Directory of your own environment modules; repeatable.
+    /// Directory of your own environment modules; repeatable [default: the current directory or its
+    /// `src`, if it has a pyproject.toml and the task's module].
     #[arg(long, value_name = "DIR")]
     python_path: Vec<PathBuf>,
     /// Argument of the environment or of gymnasium.make, such as reward_type=dense; repeatable. The
@@ -75,6 +76,14 @@ impl ConfiguredArgs {
         !self.python_path.is_empty() || self.set.iter().any(|pair| pair.trim().starts_with(key))
     }
 
+    /// Returns the folder of the Python project in the current directory that has the module of
+    /// `task`, unless an argument or a file names folders.
+    pub(super) fn project_path(&self, task: &str) -> Option<PathBuf> {
+        let is_open = !self.names_python_path() && self.config.is_none();
+        let is_open = is_open && std::env::var_os("DMPRL_TASK__PYTHON_PATH").is_none();
+        is_open.then(|| project_folder(Path::new("."), task)).flatten()
+    }
+
     /// Collects all sources of the configuration of `task`; `more` are the command's own flags.
     pub(super) fn sources<'a>(
         &'a self,
@@ -83,13 +92,16 @@ impl ConfiguredArgs {
     ) -> anyhow::Result<Sources<'a>> {
         let text = |value: &Option<String>| value.clone().map(Value::String);
         let count = |value: Option<u32>| value.map(|value| Value::Integer(value.into()));
+        let found = self.project_path(task);
+        let python_path = found.as_slice().iter().chain(&self.python_path).cloned();
+        let python_path: Vec<_> = python_path.collect();
         let flags = [
             flag("--algo", "algorithm.name", text(&self.algo)),
             flag("--policy", "policy.kind", text(&self.policy)),
             flag("--workers", "actors.workers", count(self.workers)),
             flag("--envs-per-worker", "actors.envs_per_worker", count(self.envs_per_worker)),
             flag("--seed", "run.seed", self.seed.map(Value::Integer)),
-            flag("--python-path", "task.python_path", paths("--python-path", &self.python_path)?),
+            flag("--python-path", "task.python_path", paths("--python-path", &python_path)?),
         ];
         Ok(Sources {
             task,
@@ -105,6 +117,18 @@ impl ConfiguredArgs {
             flags: flags.into_iter().chain(more).flatten().collect(),
         })
     }
+}
+
+/// Returns the folder in the Python project `project` from which the module of `task` is imported:
+/// the project's own or its `src`.
+fn project_folder(project: &Path, task: &str) -> Option<PathBuf> {
+    let (module, _) = task.split_once(':')?;
+    let first = module.split('.').next().filter(|name| !name.is_empty())?;
+    let has_module = |folder: &PathBuf| {
+        folder.join(first).is_dir() || folder.join(first).with_extension("py").is_file()
+    };
+    let folders = [project.to_owned(), project.join("src")];
+    folders.into_iter().find(has_module).filter(|_| project.join("pyproject.toml").is_file())
 }
 
 /// A flag that sets `key`, or `None` if it was not given.
@@ -191,4 +215,25 @@ fn environment() -> anyhow::Result<Vec<(String, String)>> {
         }
     }
     Ok(texts)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_folder_of_a_python_project_is_found_by_the_module() {
+        let project = tempfile::tempdir().unwrap();
+        let at = |name: &str| project.path().join(name);
+        let found = |task: &str| project_folder(project.path(), task);
+        std::fs::write(at("arm.py"), "").unwrap();
+        std::fs::create_dir_all(at("src/lab_envs")).unwrap();
+        assert_eq!(found("arm:Arm-v0"), None, "no pyproject.toml");
+        std::fs::write(at("pyproject.toml"), "").unwrap();
+        assert_eq!(found("arm:Arm-v0"), Some(project.path().to_owned()));
+        assert_eq!(found("lab_envs.arms:Arm"), Some(at("src")));
+        for elsewhere in ["other:Arm-v0", "reacher", "Reacher-v5", ":Arm", ".x:Arm"] {
+            assert_eq!(found(elsewhere), None, "{elsewhere}");
+        }
+    }
 }

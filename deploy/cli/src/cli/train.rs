@@ -115,7 +115,8 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     let said = Said {
         task: &args.task,
         file: args.configured.config.as_deref(),
-        python_path: args.configured.names_python_path(),
+        python_path: args.configured.names_python_path()
+            || args.configured.project_path(&args.task).is_some(),
     };
     said.check(&config, args.trust)?;
     let spec = task_defaults(&args.task).map(TaskDefaults::spec);
@@ -136,6 +137,9 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
         say(&format!(
             "preset {preset}, for goals with a sparse reward (--preset default: without it)"
         ));
+    }
+    if args.configured.project_path(&args.task).is_some() {
+        say(&format!("modules from {}, the project here", config.task.python_path.join(", ")));
     }
     train_session(TrainingPlan {
         program: this_program()?,
