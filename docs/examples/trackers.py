@@ -5,7 +5,7 @@
     dmprl.train("reacher", callbacks=[Wandb(project="arm")])
     dmprl.train("reacher", callbacks=[Mlflow("arm")])
 
-Trackio has Weights & Biases' functions: ``Wandb(trackio, project="arm")``.
+Trackio has the same functions as Weights & Biases: ``Wandb(trackio, project="arm")``.
 """
 
 from __future__ import annotations

@@ -30,23 +30,24 @@ class Callback:
     def on_evaluation(self, run: Run, row: dict[str, Any]) -> bool | None:
         """Called after each evaluation; False stops the training with a checkpoint.
 
-        :param row: a line of ``evaluations.jsonl``.
+        :param row: the line of ``evaluations.jsonl``.
         """
 
     def on_metrics(self, run: Run, row: dict[str, Any]) -> bool | None:
-        """Called after each line of ``metrics.jsonl``; False stops the training.
+        """Called after each line of ``metrics.jsonl``; False stops the training with a checkpoint.
 
         :param row: the line; keys of nested objects are joined by ``/``.
         """
 
     def on_checkpoint(self, run: Run, path: Path) -> bool | None:
-        """Called after a checkpoint; False stops the training. Later ones replace the oldest.
+        """Called after a checkpoint; False stops the training.
 
-        :param path: the folder of the checkpoint.
+        :param path: the folder of the checkpoint. It is deleted once ``checkpoint.keep`` newer ones
+            exist.
         """
 
     def on_end(self, run: Run) -> None:
-        """Called after the last line of a training that ended, was stopped or was interrupted."""
+        """Called once at the end, also after a stop or an interrupt."""
 
 
 class Watch:
@@ -60,7 +61,7 @@ class Watch:
 
     def poll(self) -> bool:
         """Makes the calls that are due; returns False if one of them stops the training."""
-        if not (self._directory / "manifest.json").is_file():
+        if not self._callbacks or not (self._directory / "manifest.json").is_file():
             return True
         run, goes_on = Run(self._directory), True
         for row in self._new_rows("metrics.jsonl"):

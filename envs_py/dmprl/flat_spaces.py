@@ -9,16 +9,16 @@ from gymnasium import spaces
 from dmprl.segment_env import UnsupportedSpaceError
 
 SUPPORTED = (
-    "supported are Box observations, also in a Dict or Tuple, that are no images, and a bounded "
-    "Box action with a floating-point type; each is flattened"
+    "supported are Box observations except images, alone or in a Dict or Tuple, and a bounded Box "
+    "action with a floating-point type; dmprl flattens both"
 )
 
 
 def flattened(env: gymnasium.Env, task_id: str) -> gymnasium.Env:
     """Wraps ``env`` so that each of its spaces is a Box with one dimension.
 
-    :raises UnsupportedSpaceError: for images, and for spaces that are neither Box nor made of
-        several; the message names the entry.
+    :raises UnsupportedSpaceError: for an image or another space that is not supported, with its
+        name.
     """
     observation, action = env.observation_space, env.action_space
     image = image_in(observation)

@@ -74,6 +74,10 @@ class GymnasiumSegmentEnv(SegmentEnv):
         self.env_count = env_count
         self.segment_steps = segment_steps
         self._registered = self._registration(named)
+        if "mujoco" in sys.modules:
+            from dmprl import mujoco_warnings
+
+            mujoco_warnings.to_standard_error()
         self._observation_space = None
         self._goals: GymnasiumGoals | None = None
         self._envs = [self._make() for _ in range(env_count)]
@@ -116,10 +120,6 @@ class GymnasiumSegmentEnv(SegmentEnv):
         registered.order_enforce = False
         if isinstance(registered.entry_point, str):
             registration.load_env_creator(registered.entry_point)  # imports its module
-        if "mujoco" in sys.modules:
-            from dmprl import mujoco_warnings
-
-            mujoco_warnings.to_standard_error()
         return registered
 
     def _make_unregistered(self) -> gymnasium.Env:

@@ -9,6 +9,8 @@ import sys
 
 import mujoco
 
+from dmprl.mujoco_batch import mujoco_hook
+
 MESSAGES_MAX = 100
 """Maximum number of messages that are shown. An unstable simulation warns at every step."""
 
@@ -16,8 +18,9 @@ _shown: set[str] = set()
 
 
 def to_standard_error() -> None:
-    """Replaces MuJoCo's handler of warnings."""
-    mujoco.set_mju_user_warning(_show)
+    """Replaces MuJoCo's own handler, but not that of :func:`~dmprl.mujoco_batch.quieten_mujoco`."""
+    if mujoco_hook("mju_user_warning").value is None:
+        mujoco.set_mju_user_warning(_show)
 
 
 def _show(message: str) -> None:

@@ -6,11 +6,11 @@ import sys
 import tempfile
 import unittest
 
-BEHIND = """
+UNSTABLE = """
 import mujoco
 from dmprl.segment_env import make
 
-make("InvertedPendulum-v5", 1, 5)
+make("ENVIRONMENT", 1, 5)
 model = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
 )
@@ -22,11 +22,17 @@ for _ in range(3):
 
 
 class WarningsTest(unittest.TestCase):
-    def test_a_warning_is_told_once_and_leaves_no_file_in_the_folder(self):
+    def test_a_registered_environment(self):
+        self.assert_told_once_and_without_a_file("InvertedPendulum-v5")
+
+    def test_a_class(self):
+        self.assert_told_once_and_without_a_file("tiny_envs:Countdown")
+
+    def assert_told_once_and_without_a_file(self, environment):
         with tempfile.TemporaryDirectory() as folder:
             paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
             ran = subprocess.run(
-                [sys.executable, "-c", BEHIND],
+                [sys.executable, "-c", UNSTABLE.replace("ENVIRONMENT", environment)],
                 cwd=folder,
                 env={**os.environ, **paths},
                 capture_output=True,

@@ -19,12 +19,13 @@ use crate::update::network::TrainableNetwork;
 /// Minimum standard deviation of a dimension that is scaled. Dividing by a smaller one would
 /// magnify the first deviation.
 const SCALE_MIN: f64 = 1e-4;
-/// Largest normalised value with goals, as in Andrychowicz et al. 2017, who clip to it. A strike
-/// gives an object that mostly lies still 20 to 50 standard deviations of velocity. Clipping would
-/// not be linear and could not be folded, so the scale of such an entry is larger instead.
+/// Largest normalised value with goals. Andrychowicz et al. 2017 clip to this value. Clipping is
+/// not linear and could not be folded, so an entry with larger values gets a larger scale instead.
+/// An example is the velocity of an object that is seldom touched.
 const NORMALISED_MAX: f64 = 5.0;
-/// Limit of that enlargement, so that one object that falls far does not hide small motions.
-const ENLARGED_MAX: f64 = 4.0;
+/// Largest scale, in standard deviations. Without this limit, a single fall from the table would
+/// make all smaller motions hard to tell apart.
+const SCALE_MAX: f64 = 4.0;
 
 /// The place of the goals in an observation. Networks get the desired goal minus the achieved one
 /// instead of the desired goal: whether a goal is reached depends on a difference that is small
@@ -74,7 +75,8 @@ pub struct Normaliser {
     seen_mean: Vec<f64>,
     /// Sum of squared differences from the mean (Welford 1962).
     seen_squares: Vec<f64>,
-    /// Largest distance from the mean at its time. Absent in checkpoints from before 2026-11-26.
+    /// Largest distance of an observation from the mean so far. Absent in checkpoints from before
+    /// 2026-11-26.
     #[serde(default)]
     seen_farthest: Vec<f64>,
     /// Number of observations at which mean and scale are updated.
@@ -205,12 +207,13 @@ impl Normaliser {
         NormalisationChange { before, after: Some(self.mean_and_scale()) }
     }
 
-    /// Returns the standard deviation of an entry, enlarged with goals if values are far out.
+    /// Returns the scale of an entry: its standard deviation, or more with goals if values were far
+    /// from the mean.
     fn seen_scale(&self, index: usize) -> f64 {
         let std = (self.seen_squares[index] / self.count.max(1) as f64).sqrt();
         let farthest = self.seen_farthest.get(index).filter(|_| self.relative.is_some());
-        let enlarged = farthest.map_or(std, |farthest| farthest / NORMALISED_MAX);
-        enlarged.clamp(std, ENLARGED_MAX * std)
+        let scale = farthest.map_or(std, |farthest| farthest / NORMALISED_MAX);
+        scale.clamp(std, SCALE_MAX * std)
     }
 
     fn mean_and_scale(&self) -> [Cow<'static, [f32]>; 2] {
@@ -358,28 +361,27 @@ mod tests {
         assert_eq!(out, [-1.0, 1.0]);
     }
 
+    /// Returns the scale of an entry that is 0 in `count - 1` observations, and then `value`.
+    fn scale_of_rare(value: f32, count: usize, relative: Option<RelativeGoal>) -> f32 {
+        let mut rows = vec![0.0; 3 * count];
+        rows[3 * count - 1] = value;
+        let mut normaliser = Normaliser::new(3, 1, relative);
+        normaliser.observe(&rows);
+        normaliser.update();
+        normaliser.scale[2]
+    }
+
     #[test]
-    fn rare_values_far_out_enlarge_the_scale_with_goals() {
-        // The last entry is 0 in 99 of 100 observations: mean 0.1, standard deviation sqrt(0.99).
-        let rows: Vec<f32> = (0..100).flat_map(|row| [0.0, 0.0, row as f32 / 10.0]).collect();
-        let rare: Vec<f32> = rows
-            .chunks_exact(3)
-            .flat_map(|row| [0.0, 0.0, f32::from(row[2] == 9.9) * 10.0])
-            .collect();
-        let scaled = |relative, rows: &[f32]| {
-            let mut normaliser = Normaliser::new(3, 1, relative);
-            normaliser.observe(rows);
-            normaliser.update();
-            let mut out = [0.0; 3];
-            normaliser.apply_row(&[0.0, 0.0, 10.1], &mut out);
-            out[2]
-        };
+    fn rare_values_far_from_the_mean_get_a_larger_scale_with_goals() {
         let goals = Some(RelativeGoal::new(&goal_rule()));
-        let std = 0.99_f32.sqrt();
-        assert_close(&[scaled(None, &rare)], &[10.0 / std]);
-        // The rare value was 9.9 from the mean, so 9.9 becomes 5.
-        assert_close(&[scaled(goals, &rare)], &[10.0 / 9.9 * 5.0]);
-        assert_close(&[scaled(goals, &rows)], &[scaled(None, &rows)]);
+        // Mean 0.1, variance 100 / 100 - 0.1². The value is 9.9 from the mean, and becomes 5.
+        assert_close(&[scale_of_rare(10.0, 100, goals)], &[9.9 / 5.0]);
+        assert_close(&[scale_of_rare(10.0, 100, None)], &[0.99_f32.sqrt()]);
+        // Standard deviation 2, and 2 from the mean: the scale is not smaller.
+        assert_close(&[scale_of_rare(4.0, 2, goals)], &[2.0]);
+        // Mean 1/30, variance 900 / 900 - 1/900. 1/5 of the distance is 6: the limit applies.
+        let std = (1.0_f32 - 1.0 / 900.0).sqrt();
+        assert_close(&[scale_of_rare(30.0, 900, goals)], &[4.0 * std]);
     }
 
     #[test]

@@ -93,8 +93,7 @@ impl ConfiguredArgs {
         let text = |value: &Option<String>| value.clone().map(Value::String);
         let count = |value: Option<u32>| value.map(|value| Value::Integer(value.into()));
         let found = self.project_path(task);
-        let python_path = found.as_slice().iter().chain(&self.python_path).cloned();
-        let python_path: Vec<_> = python_path.collect();
+        let python_path = found.map_or_else(|| self.python_path.clone(), |folder| vec![folder]);
         let flags = [
             flag("--algo", "algorithm.name", text(&self.algo)),
             flag("--policy", "policy.kind", text(&self.policy)),

@@ -115,8 +115,7 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     let said = Said {
         task: &args.task,
         file: args.configured.config.as_deref(),
-        python_path: args.configured.names_python_path()
-            || args.configured.project_path(&args.task).is_some(),
+        python_path: args.configured.names_python_path(),
     };
     said.check(&config, args.trust)?;
     let spec = task_defaults(&args.task).map(TaskDefaults::spec);
@@ -139,7 +138,8 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
         ));
     }
     if args.configured.project_path(&args.task).is_some() {
-        say(&format!("modules from {}, the project here", config.task.python_path.join(", ")));
+        let folder = config.task.python_path.join(", ");
+        say(&format!("modules from {folder}, because this folder has a pyproject.toml"));
     }
     train_session(TrainingPlan {
         program: this_program()?,
