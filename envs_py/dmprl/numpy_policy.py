@@ -67,7 +67,10 @@ class NumpyPolicy:
         x, log_std = x[:, : self._decisions], x[:, self._decisions :]
         if noise is not None:
             noise.disturb_outputs(x)
-        u = x[:, None, :] if self._head is None else self._head.u(x, self._observations)
+        if self._head is None:
+            u = x.reshape(len(x), self.segment_steps, self.action_len)
+        else:
+            u = self._head.u(x, self._observations)
         if noise is not None and log_std.size > 0:
             u += noise.own_draws(log_std.reshape(u.shape))
         if self._bounded:

@@ -364,7 +364,7 @@ def _plan(file: PolicyFile) -> dict[str, Any]:
     description = file.description
     policy, spec = description["policy"], description["spec"]
     is_dmp = policy["kind"] == "dmp"
-    steps: int = policy["segment_steps"] if is_dmp else 1
+    steps: int = 1 if policy["kind"] == "mlp" else policy["segment_steps"]
     if is_dmp:
         expected = (3 * steps, 3 + description["dmp"]["basis_count"])
         if file.segment_map is None or file.segment_map.shape != expected:
@@ -378,7 +378,7 @@ def _plan(file: PolicyFile) -> dict[str, Any]:
     # SAC's network outputs the log-stds after the decisions.
     log_stds_len = steps * spec["action_len"] if description["algorithm"] == "sac" else 0
     controlled = 4 if policy["controller"] == "inverse" else 0
-    decided = 1 + description["dmp"]["basis_count"] + controlled if is_dmp else 1
+    decided = 1 + description["dmp"]["basis_count"] + controlled if is_dmp else steps
     outputs = decided * spec["action_len"] + log_stds_len
     if widths[-1] != outputs:
         name = f"actor.{len(file.layers) - 1}.weight"

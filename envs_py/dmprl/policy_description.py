@@ -7,7 +7,7 @@ from typing import Any
 
 WORDS = {
     "algorithm": ("ddpg", "td3", "sac", "ndp"),
-    "policy.kind": ("dmp", "mlp"),
+    "policy.kind": ("dmp", "mlp", "chunk"),
     "policy.controller": ("inverse", "position"),
     "policy.rho": ("bounded", "free"),
     "policy.start": ("zero", "observed", "carry"),

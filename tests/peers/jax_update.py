@@ -92,7 +92,7 @@ class Policy:
         self.per_dimension = 1 + settings.basis_count + 4
         numbers = settings.steps * settings.action_len
         dmp = settings.policy == "dmp"
-        self.head = settings.action_len * (self.per_dimension if dmp else 1)
+        self.head = settings.action_len * (self.per_dimension if dmp else settings.steps)
         self.outputs = self.head + (numbers if settings.algorithm == "sac" else 0)
         self.matrix = segment_matrix(settings) if dmp else None
 
@@ -101,8 +101,9 @@ class Policy:
         s = self.s
         outputs = run_network(parameters, observations)
         extra = outputs[:, self.head :]
-        if s.policy == "mlp":
-            return outputs[:, None, : self.head], outputs[:, :0], extra
+        if s.policy != "dmp":
+            decided = outputs[:, : self.head].reshape(-1, s.steps, s.action_len)
+            return decided, outputs[:, :0], extra
         head = jnp.tanh(outputs[:, : self.head].reshape(-1, s.action_len, self.per_dimension))
         goal = s.goal_range * head[..., :1]
         weights = s.weight_range * s.omega**2 * head[..., 1 : 1 + s.basis_count]

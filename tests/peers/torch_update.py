@@ -43,7 +43,7 @@ def segment_matrix(settings):
 
 def make_policy(settings, extra_outputs=0):
     """The policy that the settings name."""
-    kinds = {"mlp": MlpPolicy, "dmp": MappedDmpPolicy}
+    kinds = {"mlp": MlpPolicy, "chunk": MlpPolicy, "dmp": MappedDmpPolicy}
     return kinds[settings.policy](settings, extra_outputs)
 
 

@@ -27,9 +27,10 @@ const CORNERS: [f64; 4] = [0.0, -0.0, 1.0, -1.0];
 type Keys = &'static [(&'static str, &'static str)];
 
 /// Name, task, and configuration keys that differ from the task's defaults.
-pub const KINDS: [(&str, &str, Keys); 9] = [
+pub const KINDS: [(&str, &str, Keys); 10] = [
     ("dmp", "reacher", &[]),
     ("mlp", "pusher", &[("policy.kind", "mlp")]),
+    ("sac-chunk", "pusher", &[("algorithm.name", "sac"), ("policy.kind", "chunk")]),
     ("sac-mlp", "reacher", &[("algorithm.name", "sac"), ("policy.kind", "mlp")]),
     ("sac-dmp", "pusher", &[("algorithm.name", "sac"), ("policy.segment_steps", "8")]),
     ("angles", "reacher", &[("policy.start", "observed"), ("policy.rho", "free")]),

@@ -111,6 +111,7 @@ fn assert_same(task: &str, keys: &[(&str, &str)]) {
 #[test]
 fn a_network_that_decides_every_step_acts_the_same() {
     assert_same("reacher", &[("policy.kind", "mlp")]);
+    assert_same("reacher", &[("policy.kind", "chunk")]);
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! The report of `dmprl bench rollout`: one JSON object for programs, a table for people.
 
 use dmprl_run::Machine;
-use dmprl_shared::config::{ExperimentConfig, PolicyKind};
+use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::spec::EnvSpec;
 use serde_json::{Map, Value, json};
 
@@ -107,10 +107,7 @@ impl Figures {
     }
 
     pub(super) fn policy(&self) -> &'static str {
-        match self.config.policy.kind {
-            PolicyKind::Dmp => "dmp",
-            PolicyKind::Mlp => "mlp",
-        }
+        self.config.policy.kind.name()
     }
 
     /// Returns the figures as one JSON object. Unavailable ones are null.

@@ -100,7 +100,7 @@ impl<'a> NumpyPlan<'a> {
 }
 
 fn segment_map(config: &ExperimentConfig) -> anyhow::Result<Vec<f32>> {
-    if config.policy.kind == PolicyKind::Mlp {
+    if config.policy.kind != PolicyKind::Dmp {
         return Ok(Vec::new());
     }
     let dmp = Dmp::new(&config.dmp, config.policy.segment_steps)?;

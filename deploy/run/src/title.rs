@@ -5,7 +5,7 @@ use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PRESETS, PolicyKind}
 /// Describes a run in one line.
 #[must_use]
 pub fn title(config: &ExperimentConfig) -> String {
-    let policy = format!("{:?}", config.policy.kind).to_lowercase();
+    let policy = config.policy.kind.name();
     let algorithm = format!("{:?}", config.algorithm.name).to_lowercase();
     let actors = &config.actors;
     let count =
@@ -40,6 +40,7 @@ fn method(config: &ExperimentConfig) -> String {
     match config.policy.kind {
         PolicyKind::Dmp => format!("{algorithm}-DMP"),
         PolicyKind::Mlp => algorithm.to_owned(),
+        PolicyKind::Chunk => format!("{algorithm}-chunk"),
     }
 }
 

@@ -217,9 +217,11 @@ fn assert_close(what: &str, got: &[f32], expected: &[f32], tolerance: f64) {
 #[test]
 fn every_update_equals_that_of_an_independent_implementation() {
     let files = files();
-    for kind in ["ddpg_dmp", "ddpg_mlp", "td3_dmp", "td3_mlp", "sac_dmp", "sac_mlp"] {
-        let file = folder().join(kind).with_extension("safetensors");
-        assert!(files.contains(&file), "no {kind}");
+    for algorithm in ["ddpg", "td3", "sac"] {
+        for policy in ["dmp", "mlp", "chunk"] {
+            let file = folder().join(format!("{algorithm}_{policy}.safetensors"));
+            assert!(files.contains(&file), "no {}", file.display());
+        }
     }
     files.iter().for_each(|file| Golden::read(file).check());
 }

@@ -120,9 +120,10 @@ fn assert_within(tolerance: f64, name: &str, got: &[f32], expected: &[f32]) {
 
 #[test]
 fn an_update_equals_automatic_differentiation() {
-    let cases: [&[(&str, &str)]; 14] = [
+    let cases: [&[(&str, &str)]; 16] = [
         &[],
         &[("policy.kind", "mlp")],
+        &[("policy.kind", "chunk")],
         &[("policy.start", "observed")],
         &[("policy.start", "observed"), ("policy.start_velocity", "zero")],
         &[("policy.start", "carry"), ("policy.rho", "free")],
@@ -134,6 +135,7 @@ fn an_update_equals_automatic_differentiation() {
         &[("algorithm.td3.target_smaller_weight", "0.75")],
         &[("algorithm.action_rate_penalty", "0.7")],
         &[("algorithm.action_rate_penalty", "0.7"), ("policy.kind", "mlp")],
+        &[("algorithm.action_rate_penalty", "0.7"), ("policy.kind", "chunk")],
         &[("algorithm.action_rate_penalty", "0.7"), ("policy.start", "carry")],
     ];
     for algorithm in ["ddpg", "td3", "sac"] {

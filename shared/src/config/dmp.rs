@@ -120,6 +120,21 @@ pub enum PolicyKind {
     Dmp,
     /// A network that outputs one action; it decides at every environment step.
     Mlp,
+    /// A network that outputs the actions of a segment. It has everything that `dmp` has except the
+    /// movement primitive, so a comparison shows the primitive's share.
+    Chunk,
+}
+
+impl PolicyKind {
+    /// The kind's name in a configuration.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Dmp => "dmp",
+            Self::Mlp => "mlp",
+            Self::Chunk => "chunk",
+        }
+    }
 }
 
 /// Bounds of the inverse controller's parameters rho.
@@ -247,11 +262,11 @@ impl Default for PolicyConfig {
 }
 
 impl PolicyConfig {
-    /// Returns the environment steps of one decision: K for `dmp`, 1 for `mlp`.
+    /// Returns the environment steps of one decision: K for `dmp` and `chunk`, 1 for `mlp`.
     #[must_use]
     pub fn decision_steps(&self) -> usize {
         match self.kind {
-            PolicyKind::Dmp => self.segment_steps,
+            PolicyKind::Dmp | PolicyKind::Chunk => self.segment_steps,
             PolicyKind::Mlp => 1,
         }
     }

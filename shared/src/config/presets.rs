@@ -188,7 +188,7 @@ pub fn suitable_preset(task: &str) -> &'static str {
 #[must_use]
 pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
     match kind {
-        PolicyKind::Dmp => None,
+        PolicyKind::Dmp | PolicyKind::Chunk => None,
         // No preset sets the target entropy.
         PolicyKind::Mlp => {
             let text = "[pacing]\nupdates_per_segment = 1.0\n\

@@ -68,7 +68,9 @@ impl ExperimentConfig {
         self.check_counts()?;
         self.check_numbers()?;
         self.check_goals()?;
-        self.check_dmp()?;
+        if self.policy.kind == PolicyKind::Dmp {
+            self.check_dmp()?;
+        }
         self.check_combinations()?;
         self.check_ndp()?;
         self.check_delivery()?;
@@ -287,12 +289,12 @@ impl ExperimentConfig {
         let dmp = self.policy.kind == PolicyKind::Dmp;
         let draws_dmp_parameters = self.exploration.warm_up_kind == WarmUpKind::DmpParameters;
         range("exploration.warm_up_kind", "dmp_parameters", dmp || !draws_dmp_parameters, || {
-            "uniform with policy.kind = \"mlp\", which has no DMP parameters".into()
+            "uniform with this policy.kind, which has no DMP parameters".into()
         })?;
         let perturbs_dmp_parameters =
             self.exploration.kind == super::ExplorationKind::DmpParameters;
         range("exploration.kind", "dmp_parameters", dmp || !perturbs_dmp_parameters, || {
-            "another kind of noise with policy.kind = \"mlp\", which has no DMP parameters".into()
+            "another kind of noise with this policy.kind, which has no DMP parameters".into()
         })?;
         let carry = dmp && self.policy.start == Start::Carry;
         range("exploration.warm_up_kind", "uniform", draws_dmp_parameters || !carry, || {
@@ -343,7 +345,8 @@ impl ExperimentConfig {
         let fits = (-10.0..=2.0).contains(&log_std);
         range("algorithm.ndp.initial_log_std", log_std, fits, || "from -10 to 2".into())?;
         let on_policy = self.algorithm.name == AlgorithmName::Ndp;
-        range("policy.kind", "mlp", !on_policy || self.policy.kind == PolicyKind::Dmp, || {
+        let kind = self.policy.kind;
+        range("policy.kind", kind.name(), !on_policy || kind == PolicyKind::Dmp, || {
             "dmp with algorithm.name = \"ndp\", which learns only movement primitives".into()
         })?;
         let warm_up = self.exploration.warm_up_steps;
@@ -434,6 +437,12 @@ mod tests {
             ExperimentConfig::default().resolve(Limits { cores: 8 }).unwrap().actors.workers,
             7
         );
+    }
+
+    #[test]
+    fn only_a_primitive_needs_integration_steps_that_fit() {
+        let of = |kind| resolved(&[("policy.segment_steps", "7"), ("policy.kind", kind)]);
+        assert!(of("dmp").is_err() && of("chunk").is_ok());
     }
 
     #[test]

@@ -32,6 +32,7 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
     }
     match config.policy.kind {
         PolicyKind::Mlp => list.push_str(" mlp"),
+        PolicyKind::Chunk => list.push_str(&format!(" chunk {}", config.policy.segment_steps)),
         PolicyKind::Dmp => list.push_str(&dmp(config, spec)),
     }
     if config.algorithm.name == AlgorithmName::Sac {
@@ -159,6 +160,7 @@ mod tests {
             ("dmp.alpha_y", "12.0"),
             ("dmp.integrator", "explicit"),
             ("policy.kind", "mlp"),
+            ("policy.kind", "chunk"),
             ("algorithm.name", "sac"),
             ("policy.controller", "position"),
             ("algorithm.name", "ndp"),

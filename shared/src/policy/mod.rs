@@ -8,9 +8,9 @@
 //!                                                            ▼
 //!                              actions u in [-1, 1] ◄── inverse controller ◄── y, yd, ydd
 //! ```
-//! `network` is the multilayer perceptron. `dmp_head` is the rest of the `dmp` policy. The `mlp`
-//! policy is the network followed by a tanh. All code works on flat `f32` slices and on buffers
-//! that are allocated once.
+//! `network` is the multilayer perceptron. `dmp_head` is the rest of the `dmp` policy. The policies
+//! `mlp` and `chunk` are the network followed by a tanh. All code works on flat `f32` slices and on
+//! buffers that are allocated once.
 
 mod action_scaling;
 mod architecture;
@@ -71,7 +71,7 @@ pub enum PolicyError {
 /// The part of a policy that maps the network's outputs to actions.
 #[derive(Debug)]
 pub enum Head {
-    /// One action: u = tanh(output).
+    /// No movement primitive: u = tanh(output), one action (`mlp`) or K (`chunk`).
     Mlp,
     /// A segment of actions from DMP and inverse-controller parameters.
     Dmp(Box<DmpHead>),
@@ -122,11 +122,11 @@ impl Policy {
             action_len: spec.action_len,
         };
         let head = match config.policy.kind {
-            PolicyKind::Mlp => Head::Mlp,
+            PolicyKind::Mlp | PolicyKind::Chunk => Head::Mlp,
             PolicyKind::Dmp => Head::Dmp(Box::new(DmpHead::new(config, spec)?)),
         };
         let head_outputs = match &head {
-            Head::Mlp => spec.action_len,
+            Head::Mlp => layout.actions_len(),
             Head::Dmp(head) => head.outputs_len(),
         };
         let gaussian = config.algorithm.name == AlgorithmName::Sac;
@@ -137,7 +137,7 @@ impl Policy {
         Ok(Self {
             shape: MlpShape::new(widths),
             learned_std: LearnedStd::of(config, spec),
-            squashes: config.policy.kind == PolicyKind::Mlp
+            squashes: config.policy.kind != PolicyKind::Dmp
                 || config.policy.controller == Controller::Inverse,
             head,
             head_outputs,
@@ -278,9 +278,9 @@ impl Policy {
                 head.segment(observations, dmp, &mut work.means);
             }
             _ => {
-                let dims = self.layout.action_len;
-                let rows = outputs.chunks_exact(stride).zip(work.means.chunks_exact_mut(dims));
-                rows.for_each(|(outputs, means)| means.copy_from_slice(&outputs[..dims]));
+                let len = self.layout.actions_len();
+                let rows = outputs.chunks_exact(stride).zip(work.means.chunks_exact_mut(len));
+                rows.for_each(|(outputs, means)| means.copy_from_slice(&outputs[..len]));
             }
         }
         self.bound_means(work, rows * self.layout.actions_len());

@@ -108,6 +108,7 @@ fn policy_is_restored_from_the_file_alone() {
     for keys in [
         &[][..],
         &[("policy.kind", "mlp"), ("algorithm.name", "sac")],
+        &[("policy.kind", "chunk")],
         &[("algorithm.name", "ndp"), ("policy.controller", "position")],
         &[("policy.start", "carry"), ("dmp.alpha_y", "12.5"), ("policy.rho", "free")],
         &[("policy.start", "observed"), ("task.start_sources", sources)],

@@ -116,7 +116,8 @@ fn invalid_observation_is_rejected_at_every_step_and_changes_nothing() {
 
 #[test]
 fn actions_stay_within_bounds_for_any_observation() {
-    for keys in [&[][..], &[("policy.rho", "free")], CARRY, &[("policy.kind", "mlp")]] {
+    let chunk = [("policy.kind", "chunk")];
+    for keys in [&[][..], &[("policy.rho", "free")], CARRY, &[("policy.kind", "mlp")], &chunk] {
         let mut runtime = runtime(keys);
         for exponent in 0..39 {
             for sign in [-1.0, 1.0] {

@@ -158,7 +158,7 @@ class Sac(ActorCritic):
     def __init__(self, settings, kit):
         numbers = settings.steps * settings.action_len
         super().__init__(settings, kit, 2, extra_outputs=numbers)
-        self.target_entropy = -numbers / 2 if settings.policy == "dmp" else -settings.action_len
+        self.target_entropy = -settings.action_len if settings.policy == "mlp" else -numbers / 2
         self.log_temperature = torch.zeros(1, requires_grad=True)
         self.temperature_adam = kit.adam([self.log_temperature], TEMPERATURE_LEARNING_RATE)
 

@@ -47,6 +47,7 @@ BASE = Settings(
 VARIANTS = {
     "dmp": {},
     "mlp": dict(policy="mlp"),
+    "chunk": dict(policy="chunk"),
     "dmp_carry": dict(start="carry"),
     "dmp_first": dict(critic="first"),
     "dmp_observed": dict(start="observed"),
@@ -57,8 +58,8 @@ VARIANTS = {
 # What concerns only the policy is the same for all algorithms: shown with one.
 CASES = {
     "ddpg": list(VARIANTS),
-    "td3": ["dmp", "mlp", "dmp_carry", "dmp_first"],
-    "sac": ["dmp", "mlp", "dmp_carry", "dmp_first"],
+    "td3": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_first"],
+    "sac": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_first"],
 }
 
 
@@ -108,7 +109,7 @@ def configuration(case):
         keys["algorithm.td3.target_noise_clip"] = SMOOTHING_MAX
         keys["algorithm.td3.actor_interval"] = 2
     if case.algorithm == "sac":
-        keys["algorithm.sac.target_entropy_per_action"] = -0.5 if case.policy == "dmp" else -1.0
+        keys["algorithm.sac.target_entropy_per_action"] = -1.0 if case.policy == "mlp" else -0.5
         keys["algorithm.sac.temperature_learning_rate"] = TEMPERATURE_LEARNING_RATE
     return {key: str(value) for key, value in keys.items()}
 

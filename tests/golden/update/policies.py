@@ -1,4 +1,4 @@
-"""From observation to a segment before its tanh: the policies `mlp` and `dmp`."""
+"""From observation to a segment before its tanh: the policies `mlp`, `chunk` and `dmp`."""
 
 import torch
 from dmp import rollout, starts
@@ -7,7 +7,7 @@ from torch import nn
 
 
 class MlpPolicy(nn.Module):
-    """One action, decided every step."""
+    """The network alone: one action (`mlp`) or the K actions of a segment (`chunk`)."""
 
     def __init__(self, settings, extra_outputs=0):
         super().__init__()
@@ -15,14 +15,15 @@ class MlpPolicy(nn.Module):
         self.network = mlp(
             settings.policy_observation_len,
             settings.hidden,
-            settings.action_len + extra_outputs,
+            settings.steps * settings.action_len + extra_outputs,
         )
 
     def forward(self, observations):
-        """Pre-tanh actions (B, 1, A), end state (B, 0), extra outputs (B, extra)."""
+        """Pre-tanh actions (B, K, A), end state (B, 0), extra outputs (B, extra)."""
         outputs = self.network(observations)
-        dims = self.settings.action_len
-        return outputs[:, None, :dims], outputs[:, :0], outputs[:, dims:]
+        shape = (self.settings.steps, self.settings.action_len)
+        decided = shape[0] * shape[1]
+        return outputs[:, :decided].unflatten(1, shape), outputs[:, :0], outputs[:, decided:]
 
 
 class DmpPolicy(nn.Module):
@@ -68,7 +69,7 @@ class DmpPolicy(nn.Module):
 
 def make_policy(settings, extra_outputs=0):
     """The policy that the settings name."""
-    kinds = {"mlp": MlpPolicy, "dmp": DmpPolicy}
+    kinds = {"mlp": MlpPolicy, "chunk": MlpPolicy, "dmp": DmpPolicy}
     return kinds[settings.policy](settings, extra_outputs)
 
 

@@ -61,7 +61,7 @@ class Settings:
     @property
     def steps(self):
         """K: one step for `mlp`."""
-        return self.segment_steps if self.policy == "dmp" else 1
+        return 1 if self.policy == "mlp" else self.segment_steps
 
     @property
     def carries(self):

@@ -30,6 +30,7 @@ fn the_paper_preset_trains() {
 #[test]
 fn a_policy_that_decides_every_step_trains() {
     trains("reacher", &["--policy", "mlp"]);
+    trains("reacher", &["--policy", "chunk"]);
 }
 
 #[test]

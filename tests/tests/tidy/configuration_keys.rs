@@ -170,7 +170,7 @@ fn table_form(form: &Value) -> String {
 /// Returns the tables that override defaults, with a label each.
 fn others() -> Vec<(String, Table)> {
     let mut others = Vec::new();
-    for kind in [PolicyKind::Dmp, PolicyKind::Mlp] {
+    for kind in [PolicyKind::Dmp, PolicyKind::Mlp, PolicyKind::Chunk] {
         if let Some(table) = policy_defaults(kind) {
             others.push((format!("with `--policy {}`", name_of(kind)), table));
         }

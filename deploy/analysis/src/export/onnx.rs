@@ -102,7 +102,7 @@ impl<'a> PolicyGraph<'a> {
         let u = match self.opened.policy.head() {
             Head::Mlp => {
                 let u = self.graph.op("Tanh", &[&outputs]);
-                self.graph.reshape(&u, &[-1, 1, self.dims as i64])
+                self.graph.reshape(&u, &[-1, self.steps as i64, self.dims as i64])
             }
             Head::Dmp(_) => self.segment(&outputs, &observation, state.as_deref()),
         };

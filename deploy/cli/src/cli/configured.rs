@@ -17,8 +17,9 @@ pub(super) struct ConfiguredArgs {
     /// Learning algorithm.
     #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac", "ndp"]))]
     algo: Option<String>,
-    /// Policy type: one DMP per segment, or an action of the network at every step.
-    #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp"]))]
+    /// Policy type: one DMP per segment, an action of the network at every step, or a segment of
+    /// actions of the network.
+    #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp", "chunk"]))]
     policy: Option<String>,
     /// Named set of configuration values [default: `goal` for tasks with goals and a sparse reward,
     /// ours and those of Gymnasium-Robotics and panda-gym, else `default`].

@@ -230,11 +230,8 @@ fn default_path(config: &ExperimentConfig) -> anyhow::Result<PathBuf> {
         AlgorithmName::Sac => "sac",
         AlgorithmName::Ndp => "ndp",
     };
-    let policy = match config.policy.kind {
-        PolicyKind::Dmp => "dmp",
-        PolicyKind::Mlp => "mlp",
-    };
-    let (task, seed) = (safe_name(&config.task.name), config.run.seed);
+    let (policy, seed) = (config.policy.kind.name(), config.run.seed);
+    let task = safe_name(&config.task.name);
     let name = format!("{task}-{algorithm}-{policy}-s{seed}-{}", compact(SystemTime::now()));
     let candidates = (1..=SAME_SECOND_MAX).map(|number| match number {
         1 => Path::new("runs").join(&name),
