@@ -8,6 +8,7 @@ use anyhow::Context;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use dmprl_run::failure::{Outcome, wrong_use};
+use dmprl_run::format::grouped;
 use dmprl_run::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
 use dmprl_shared::config::{
     AlgorithmName, ExperimentConfig, Limits, PolicyKind, TaskDefaults, task_defaults,
@@ -141,6 +142,9 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
         let folder = config.task.python_path.join(", ");
         say(&format!("modules from {folder}, because this folder has a pyproject.toml"));
     }
+    if let Some(note) = only_warms_up(&config) {
+        say(&note);
+    }
     train_session(TrainingPlan {
         program: this_program()?,
         run,
@@ -153,6 +157,19 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
             journal: args.journal.clone(),
             restart_max: args.restart_pause_max.map(Duration::from_millis),
         },
+    })
+}
+
+/// Returns a note for a run that ends before the first update.
+fn only_warms_up(config: &ExperimentConfig) -> Option<String> {
+    let (steps, warm_up) = (config.run.steps, config.exploration.warm_up_steps);
+    (steps <= warm_up && !config.demonstrations.are_cloned()).then(|| {
+        format!(
+            "the policy will not be updated: the run has {} steps, and the first {} are its \
+             warm-up (exploration.warm_up_steps)",
+            grouped(steps),
+            grouped(warm_up)
+        )
     })
 }
 
@@ -241,4 +258,19 @@ fn default_path(config: &ExperimentConfig) -> anyhow::Result<PathBuf> {
         .into_iter()
         .find(|path| !path.exists())
         .with_context(|| format!("{SAME_SECOND_MAX} runs named {name} exist; use --run-dir"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_that_ends_within_its_warm_up_is_noted() {
+        let mut config = ExperimentConfig::default();
+        config.run.steps = config.exploration.warm_up_steps;
+        let note = only_warms_up(&config).unwrap();
+        assert!(note.contains("will not be updated") && note.contains("warm_up_steps"), "{note}");
+        config.run.steps += 1;
+        assert_eq!(only_warms_up(&config), None);
+    }
 }
