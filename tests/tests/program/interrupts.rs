@@ -109,8 +109,9 @@ fn ctrl_c_twice_ends_a_run_whose_learner_hangs() {
     let place = Workplace::new();
     let run = place.path("run");
     let mut running = training(&place, &run);
-    let before = env_steps_of_checkpoint(&run);
     stop_role(&place, "learner");
+    // Read only now: until it was stopped, the learner could write a checkpoint.
+    let before = env_steps_of_checkpoint(&run);
     running.signal_group(Signal::INT);
     running.until_event(&json!({ "event": "interrupted" }));
     // Two signals at almost the same time can merge, so the second is repeated.
