@@ -236,7 +236,7 @@ def stochastic(s, policy, state, batch):
 
     state, log_pi = actor_step(s, state, loss)
     numbers = s.steps * s.action_len
-    entropy = -numbers / 2 if s.policy == "dmp" else -s.action_len
+    entropy = -s.action_len if s.policy == "mlp" else -numbers / 2
     gradient = -(log_pi + entropy).mean()
     value, moments = adam(
         state["log_temperature"], gradient, state["temperature_adam"], TEMPERATURE_LEARNING_RATE

@@ -215,6 +215,7 @@ fn a_cloned_policy_does_what_was_demonstrated() {
     for keys in [
         &[][..],
         &[("policy.kind", "mlp")],
+        &[("policy.kind", "chunk")],
         &[("algorithm.name", "sac"), ("policy.normalise_observations", "true")],
         &[("algorithm.critic", "first"), ("algorithm.windows", "segment")],
     ] {

@@ -121,7 +121,7 @@ pub enum PolicyKind {
     /// A network that outputs one action; it decides at every environment step.
     Mlp,
     /// A network that outputs the actions of a segment. It has everything that `dmp` has except the
-    /// movement primitive, so a comparison shows the primitive's share.
+    /// movement primitive and its controller, so a comparison shows their share.
     Chunk,
 }
 

@@ -453,8 +453,8 @@ mod tests {
         let config = resolved(&[ndp, no_warm_up, no_penalty, ("actors.workers", "3")]).unwrap();
         assert_eq!(config.algorithm.ndp.rollout_segments, 10 * 3 * 8);
         let error = |more| resolved(&[ndp, no_warm_up, no_penalty, more]).unwrap_err().to_string();
-        let mlp = error(("policy.kind", "mlp"));
-        assert!(mlp.contains("only movement primitives"), "{mlp}");
+        let other = ["mlp", "chunk"].map(|kind| error(("policy.kind", kind)));
+        assert!(other.iter().all(|text| text.contains("only movement primitives")), "{other:?}");
         assert!(error(("exploration.warm_up_steps", "1")).contains("its own policy"));
         assert!(error(("algorithm.action_rate_penalty", "0.1")).contains("td3 and sac"));
         assert!(error(("policy.start", "observed")).contains("start_sources"));

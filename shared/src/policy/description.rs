@@ -20,7 +20,7 @@ pub struct PolicyDescription {
     pub algorithm: AlgorithmName,
     /// Kind, network, ranges, controller and start.
     pub policy: PolicyConfig,
-    /// The movement primitive; unused for `mlp`.
+    /// The movement primitive; used only by `dmp`.
     pub dmp: DmpConfig,
     /// Entries of an observation from which y0 and yd0 are read, for `start = "observed"`.
     pub start_sources: Vec<StartSource>,

@@ -30,6 +30,7 @@ const VALUES: [&str; 24] = [
     "first",
     "sac",
     "mlp",
+    "chunk",
     "observed",
     "9223372036854775807",
     "[[[[1]]]]",
