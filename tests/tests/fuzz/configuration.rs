@@ -10,7 +10,7 @@ use crate::{Target, Verdict, fixture};
 
 const LIMITS: Limits = Limits { cores: 2 };
 /// Values that cause errors where a number, a word or a list is expected.
-const VALUES: [&str; 24] = [
+const VALUES: [&str; 25] = [
     "0",
     "1",
     "-1",
