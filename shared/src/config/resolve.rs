@@ -286,15 +286,15 @@ impl ExperimentConfig {
         range("algorithm.target", "literal", !(literal && sliding && several), || {
             "n_step, or algorithm.windows = \"segment\", which the literal target requires".into()
         })?;
-        let dmp = self.policy.kind == PolicyKind::Dmp;
+        let (dmp, kind) = (self.policy.kind == PolicyKind::Dmp, self.policy.kind.name());
         let draws_dmp_parameters = self.exploration.warm_up_kind == WarmUpKind::DmpParameters;
         range("exploration.warm_up_kind", "dmp_parameters", dmp || !draws_dmp_parameters, || {
-            "uniform with this policy.kind, which has no DMP parameters".into()
+            format!("uniform with policy.kind = \"{kind}\", which has no DMP parameters")
         })?;
         let perturbs_dmp_parameters =
             self.exploration.kind == super::ExplorationKind::DmpParameters;
         range("exploration.kind", "dmp_parameters", dmp || !perturbs_dmp_parameters, || {
-            "another kind of noise with this policy.kind, which has no DMP parameters".into()
+            format!("another kind with policy.kind = \"{kind}\", which has no DMP parameters")
         })?;
         let carry = dmp && self.policy.start == Start::Carry;
         range("exploration.warm_up_kind", "uniform", draws_dmp_parameters || !carry, || {

@@ -17,8 +17,8 @@ pub(super) struct ConfiguredArgs {
     /// Learning algorithm.
     #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac", "ndp"]))]
     algo: Option<String>,
-    /// Policy type: one DMP per segment, an action of the network at every step, or a segment of
-    /// actions of the network.
+    /// Policy type. dmp: one movement primitive per segment. mlp: one action at every step. chunk:
+    /// the actions of a segment, without a primitive.
     #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp", "chunk"]))]
     policy: Option<String>,
     /// Named set of configuration values [default: `goal` for tasks with goals and a sparse reward,
