@@ -35,7 +35,8 @@ class NumpyPolicy:
         self.segment_steps: int = plan["decision_steps"]
         self.action_len: int = plan["spec"]["action_len"]
         low, high = np.array(plan["spec"]["action_low"]), np.array(plan["spec"]["action_high"])
-        self._mid, self._half_range = 0.5 * (low + high), 0.5 * (high - low)
+        action_range = plan["policy"].get("action_range", 1.0)
+        self._mid, self._half_range = 0.5 * (low + high), 0.5 * action_range * (high - low)
         if parameters is None:
             parameters = np.fromfile(Path(plan["parameters"]), np.float32)
         self._layers = layers(plan["widths"], parameters)

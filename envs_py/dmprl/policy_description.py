@@ -30,6 +30,10 @@ def check(description: dict[str, Any]) -> None:
     for key in POSITIVE:
         found = value(description, key)
         expect(key, found, is_finite(found) and found > 0, "a positive number")
+    # Files of older versions do not have it.
+    found = description["policy"].get("action_range", 1.0)
+    fits = is_finite(found) and 0 < found <= 1
+    expect("policy.action_range", found, fits, "a number above 0, at most 1")
     for key in COUNTS:
         found = value(description, key)
         expect(key, found, isinstance(found, int) and found > 0, "an integer, 1 or more")

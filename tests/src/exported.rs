@@ -32,7 +32,11 @@ pub const KINDS: [(&str, &str, Keys); 10] = [
     ("mlp", "pusher", &[("policy.kind", "mlp")]),
     ("sac-chunk", "pusher", &[("algorithm.name", "sac"), ("policy.kind", "chunk")]),
     ("sac-mlp", "reacher", &[("algorithm.name", "sac"), ("policy.kind", "mlp")]),
-    ("sac-dmp", "pusher", &[("algorithm.name", "sac"), ("policy.segment_steps", "8")]),
+    (
+        "sac-dmp",
+        "pusher",
+        &[("algorithm.name", "sac"), ("policy.segment_steps", "8"), ("policy.action_range", "0.6")],
+    ),
     ("angles", "reacher", &[("policy.start", "observed"), ("policy.rho", "free")]),
     ("values", "panda-reach", &[("policy.start", "observed")]),
     ("resting", "pusher", &[("policy.start", "observed"), ("policy.start_velocity", "zero")]),

@@ -123,7 +123,7 @@ fn the_mean_of_a_squashed_gaussian_acts_the_same() {
 #[test]
 fn movement_primitives_act_the_same() {
     assert_same("reacher", &[]);
-    assert_same("pusher", &[("policy.segment_steps", "8")]);
+    assert_same("pusher", &[("policy.segment_steps", "8"), ("policy.action_range", "0.6")]);
 }
 
 #[test]

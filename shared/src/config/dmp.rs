@@ -224,6 +224,9 @@ pub struct PolicyConfig {
     /// networks. Normalisation starts at the end of the warm-up. Its statistics are folded into
     /// published policies.
     pub normalise_observations: bool,
+    /// Share of each action's range, around its middle, that the policy uses. Smaller actions make
+    /// a robot slower and its contacts gentler.
+    pub action_range: f64,
     /// Bound of the goal: g = goal_range * tanh(.).
     pub goal_range: f64,
     /// Bound of the weights: w = weight_range * omega^2 * tanh(.), omega = alpha_y / 2.
@@ -249,6 +252,7 @@ impl Default for PolicyConfig {
             segment_steps: 5,
             hidden: vec![256, 256],
             normalise_observations: true,
+            action_range: 1.0,
             goal_range: 1.0,
             weight_range: 1.0,
             controller: Controller::Inverse,

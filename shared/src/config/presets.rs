@@ -83,6 +83,7 @@ const PAPER: &str = r#"
 segment_steps = 5
 hidden = [256, 256]
 normalise_observations = false
+action_range = 1.0
 goal_range = 1.0
 weight_range = 1.0
 controller = "inverse"

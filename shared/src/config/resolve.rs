@@ -197,10 +197,9 @@ impl ExperimentConfig {
                 format!("{HEARTBEAT_S_MIN} to {SECONDS_MAX}; a process reports every second")
             })?;
         }
-        let goals = [
-            ("run.until_return", self.run.until_return),
-            ("run.until_success", self.run.until_success),
-        ];
+        let run = &self.run;
+        let goals =
+            [("run.until_return", run.until_return), ("run.until_success", run.until_success)];
         for (key, got) in goals {
             range(key, got, !got.is_nan(), || "a number (inf: none)".into())?;
         }
@@ -208,6 +207,7 @@ impl ExperimentConfig {
             ("algorithm.discount", self.algorithm.discount),
             ("algorithm.polyak", self.algorithm.polyak),
             ("exploration.warm_up_range", self.exploration.warm_up_range),
+            ("policy.action_range", self.policy.action_range),
         ];
         for (key, got) in unit {
             range(key, got, got > 0.0 && got <= 1.0, || "above 0, at most 1".into())?;

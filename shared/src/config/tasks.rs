@@ -378,11 +378,13 @@ start_sources = [
     PANDA_OBJECTS,
 ];
 
-// u = 1 moves the end effector by 0.05 m, as in PANDA_REACH_VALUES.
+// u = 1 moves the end effector by 0.05 m, as in PANDA_REACH_VALUES. At that speed the arm strikes a
+// cube more than it pushes it.
 const PANDA_OBJECTS: &str = r#"
 [run]
 steps = 200000
 [policy]
+action_range = 0.6
 position_scale = 20.0
 [algorithm]
 discount = 0.98

@@ -1,6 +1,7 @@
 //! Scaling from u to the environment's units, per dimension: action = mid + half_range u.
 //!
-//! u is first clipped to [-1, 1], because draws from a Gaussian may be outside.
+//! half_range is `policy.action_range` times half the environment's range. u is first clipped to
+//! [-1, 1], because draws from a Gaussian may be outside.
 
 use crate::spec::EnvSpec;
 
@@ -12,13 +13,14 @@ pub struct ActionScaling {
 }
 
 impl ActionScaling {
-    /// Creates the scaling for an environment whose spec has been checked.
+    /// Creates the scaling for an environment whose spec has been checked, to the share `range` of
+    /// its actions, above 0 and at most 1.
     #[must_use]
-    pub fn new(spec: &EnvSpec) -> Self {
+    pub fn new(spec: &EnvSpec, range: f64) -> Self {
         let bounds = || spec.action_low.iter().zip(&spec.action_high);
         Self {
             mid: bounds().map(|(low, high)| 0.5 * (low + high)).collect(),
-            half_range: bounds().map(|(low, high)| 0.5 * (high - low)).collect(),
+            half_range: bounds().map(|(low, high)| 0.5 * range * (high - low)).collect(),
         }
     }
 
@@ -62,10 +64,15 @@ mod tests {
         };
         let mut actions = [0.0; 8];
         let u = [-1.0, -1.0, 0.0, 0.0, 1.0, 1.0, -7.0, 1.5];
-        ActionScaling::new(&spec).apply(&u, &mut actions);
+        ActionScaling::new(&spec, 1.0).apply(&u, &mut actions);
         assert_eq!(actions, [-15.0, 0.0, 0.0, 2.0, 15.0, 4.0, -15.0, 4.0]);
         let mut inverse = [0.0; 6];
-        ActionScaling::new(&spec).invert(&actions[..6], &mut inverse);
+        ActionScaling::new(&spec, 1.0).invert(&actions[..6], &mut inverse);
         assert_eq!(inverse, u[..6]);
+        let half = ActionScaling::new(&spec, 0.5);
+        half.apply(&u, &mut actions);
+        assert_eq!(actions, [-7.5, 1.0, 0.0, 2.0, 7.5, 3.0, -7.5, 3.0]);
+        half.invert(&[-15.0, 2.5], &mut inverse[..2]);
+        assert_eq!(inverse[..2], [-1.0, 0.5], "actions outside the share are clipped");
     }
 }

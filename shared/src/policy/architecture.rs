@@ -30,6 +30,9 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
         let kwargs = sorted(&Value::Table(config.task.kwargs.clone()));
         list.push_str(&format!(" task {kwargs} {:?}", config.task.wrappers));
     }
+    if config.policy.action_range != 1.0 {
+        list.push_str(&format!(" range {:?}", config.policy.action_range));
+    }
     match config.policy.kind {
         PolicyKind::Mlp => list.push_str(" mlp"),
         PolicyKind::Chunk => list.push_str(&format!(" chunk {}", config.policy.segment_steps)),
@@ -155,6 +158,7 @@ mod tests {
             ("task.kwargs.reward_type", "dense"),
             ("task.wrappers", "[\"module:name\"]"),
             ("policy.hidden", "[256]"),
+            ("policy.action_range", "0.5"),
             ("policy.rho_range", "1.0"),
             ("policy.start", "observed"),
             ("dmp.alpha_y", "12.0"),

@@ -142,7 +142,7 @@ impl Policy {
             head,
             head_outputs,
             layout,
-            scaling: ActionScaling::new(spec),
+            scaling: ActionScaling::new(spec, config.policy.action_range),
             env_observation_len: spec.observation_len,
             architecture_hash: architecture::hash(config, spec),
             description: PolicyDescription::new(config, spec),

@@ -275,7 +275,8 @@ impl<'a> PolicyGraph<'a> {
             graph.constant(&[1, 1, dims], &numbers)
         };
         let mid = per_dimension(graph, bounds().map(|(low, high)| 0.5 * (low + high)).collect());
-        let half = per_dimension(graph, bounds().map(|(low, high)| 0.5 * (high - low)).collect());
+        let range = 0.5 * self.description.policy.action_range;
+        let half = per_dimension(graph, bounds().map(|(low, high)| range * (high - low)).collect());
         let [least, most] = [-1.0, 1.0].map(|bound| graph.scalar(bound));
         let u = graph.op("Clip", &[u, &least, &most]);
         let scaled = graph.op("Mul", &[&u, &half]);
