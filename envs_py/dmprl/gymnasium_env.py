@@ -11,8 +11,6 @@ import contextlib
 import copy
 import math
 import sys
-import traceback
-from collections import deque
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
@@ -22,13 +20,12 @@ from gymnasium.envs import registration
 from numpy.typing import NDArray
 
 from dmprl import robotics_repair
+from dmprl.checked_env import FAILURES, CheckedSegmentEnv
 from dmprl.env_options import NO_OPTIONS, EnvOptions
 from dmprl.flat_spaces import flattened
 from dmprl.goal_rule import GoalRule
-from dmprl.hindsight import GymnasiumGoals
-from dmprl.observation_names import names_of
+from dmprl.hindsight import GymnasiumGoals, declared_rule
 from dmprl.segment_env import (
-    OBSERVATION_NAMES_MAX,
     SUCCESS_NO,
     SUCCESS_NOT_REPORTED,
     SUCCESS_YES,
@@ -36,20 +33,12 @@ from dmprl.segment_env import (
     GoalRows,
     Goals,
     SegmentBuffers,
-    SegmentEnv,
     SegmentEnvError,
     named_object,
-    seed_after_failure,
 )
 
-FAILURES_KEPT_MAX = 10_000
-"""Maximum number of stored failure messages; the oldest are dropped."""
 
-FAILURES = (Exception, SystemExit)
-"""Exceptions of an environment. ``sys.exit`` would otherwise end the whole worker."""
-
-
-class GymnasiumSegmentEnv(SegmentEnv):
+class GymnasiumSegmentEnv(CheckedSegmentEnv):
     """E copies of one Gymnasium environment, with all wrappers of its registration except two.
 
     The passive checker and the order enforcer are omitted: they only check the caller, which costs
@@ -69,10 +58,8 @@ class GymnasiumSegmentEnv(SegmentEnv):
         named: object = None,
         options: EnvOptions = NO_OPTIONS,
     ) -> None:
-        self.task_id = task_id
+        super().__init__(task_id, env_count, segment_steps)
         self.options = options
-        self.env_count = env_count
-        self.segment_steps = segment_steps
         self._registered = self._registration(named)
         if "mujoco" in sys.modules:
             from dmprl import mujoco_warnings
@@ -82,22 +69,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         self._goals: GymnasiumGoals | None = None
         self._envs = [self._make() for _ in range(env_count)]
         first = self._envs[0]
-        self._observation_len = first.observation_space.shape[0]
-        self._action_shape = (env_count, segment_steps, first.action_space.shape[0])
-        self._action_dtype = first.action_space.dtype
-        self._current = np.zeros((env_count, self._observation_len))
-        self._started = np.zeros(env_count, np.bool_)
-        self._rows = np.arange(env_count)
-        self._finite_observations = np.zeros(
-            (env_count, segment_steps + 1, self._observation_len), np.bool_
-        )
-        self._finite_rewards = np.zeros((env_count, segment_steps), np.bool_)
-        # Seed of the caller's last reset of each environment, and its failures since.
-        self._first_seeds = [0] * env_count
-        self._failure_counts = [0] * env_count
-        self._failed_now: list[int] = []
-        self._failure_total = 0
-        self._failures: deque[str] = deque(maxlen=FAILURES_KEPT_MAX)
+        self._allocate(first.observation_space.shape[0], first.action_space)
 
     def _registration(self, named: object) -> registration.EnvSpec:
         if "gymnasium_robotics" in sys.modules:
@@ -163,11 +135,6 @@ class GymnasiumSegmentEnv(SegmentEnv):
             "observation_names": self._observation_names(),
         }
 
-    def _observation_names(self) -> list[str]:
-        if self._observation_len > OBSERVATION_NAMES_MAX:
-            return []
-        return names_of(self._observation_space)
-
     def reset(  # noqa: D102 - inherited
         self, mask: NDArray[np.uint8], seeds: NDArray[np.uint64], out: SegmentBuffers
     ) -> None:
@@ -183,15 +150,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
     def step_segment(  # noqa: D102 - inherited
         self, actions: NDArray[np.float64], out: SegmentBuffers
     ) -> None:
-        if not self._started.all():
-            raise SegmentEnvError(
-                f"{self.task_id}, environment {int(self._started.argmin())}: step before reset"
-            )
-        if actions.shape != self._action_shape:
-            raise ValueError(f"actions {actions.shape}, expected (E, K, A) = {self._action_shape}")
-        # A new array for each call, in the space's type. An environment may keep an action, for
-        # example to penalise its change, so its memory must not be reused.
-        actions = actions.astype(self._action_dtype)
+        actions = self._typed(actions)
         out.failed.fill(0)
         out.observations[:, 0] = self._current
         for index, env in enumerate(self._envs):
@@ -207,14 +166,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
         # Last, so that new environments cannot affect the results of the others.
         while self._failed_now:
             index = self._failed_now.pop(0)
-            self._failure_counts[index] += 1
-            seed = seed_after_failure(self._first_seeds[index], self._failure_counts[index])
-            self._replace(index, seed, out)
-
-    def take_failures(self) -> list[str]:  # noqa: D102 - inherited
-        failures = list(self._failures)
-        self._failures.clear()
-        return failures
+            self._replace(index, self._seed_after_failure(index), out)
 
     def goals(self) -> Goals:  # noqa: D102 - inherited
         self._goals = GymnasiumGoals(self.task_id, self._envs[0], self._observation_space)
@@ -225,11 +177,7 @@ class GymnasiumSegmentEnv(SegmentEnv):
 
     def goal_rule(self) -> GoalRule | None:
         """Returns the environment's own ``goal_rule``, an attribute or a method, or finds one."""
-        env = self._envs[0]
-        if not env.has_wrapper_attr("goal_rule"):
-            return super().goal_rule()
-        declared = env.get_wrapper_attr("goal_rule")
-        return declared() if callable(declared) else declared
+        return declared_rule(self._envs[0], super().goal_rule)
 
     def close(self) -> None:  # noqa: D102 - inherited
         for env in self._envs:
@@ -271,37 +219,6 @@ class GymnasiumSegmentEnv(SegmentEnv):
         self._started[index] = True
         out.next_observations[index] = self._current[index]
 
-    def _check_finite(self, out: SegmentBuffers) -> None:
-        """Checks a whole segment at once, which is several times faster than step by step."""
-        if not np.isfinite(out.rewards, out=self._finite_rewards).all():
-            for index in np.flatnonzero(~self._finite_rewards.all(axis=1)).tolist():
-                step = int(self._finite_rewards[index].argmin())
-                where = f"{self.task_id}, environment {index}, step {step} of the segment"
-                reward = out.rewards[index, step]
-                self._fail(index, SegmentEnvError(f"{where}: reward is {reward}"), out)
-        if not np.isfinite(out.observations, out=self._finite_observations).all():
-            for index in np.flatnonzero(~self._finite_observations.all(axis=(1, 2))).tolist():
-                row = int(self._finite_observations[index].all(axis=1).argmin())
-                when = f"step {row - 1} of the segment"
-                self._fail(index, self._not_finite(index, when, out.observations[index, row]), out)
-
-    def _fail(self, index: int, failure: SegmentEnvError, out: SegmentBuffers) -> None:
-        """Clears the results of a failed environment; :meth:`_replace` follows."""
-        self._note(failure)
-        self._failed_now.append(index)
-        out.failed[index] = 1
-        out.observations[index] = 0.0
-        out.rewards[index] = 0.0
-        out.terminated[index], out.truncated[index] = 0, 0
-        out.success[index], out.steps[index] = SUCCESS_NOT_REPORTED, 0
-
-    def _note(self, failure: SegmentEnvError) -> None:
-        self._failures.append(str(failure))
-        self._failure_total += 1
-        # Only some tracebacks go to the worker's log: they are long and mostly identical.
-        if failure.__cause__ is not None and self._failure_total.bit_count() == 1:
-            traceback.print_exception(failure.__cause__)
-
     def _replace(self, index: int, seed: int, out: SegmentBuffers) -> None:
         """Closes a failed environment, recreates it and resets it."""
         with contextlib.suppress(*FAILURES):  # it has failed already
@@ -311,19 +228,6 @@ class GymnasiumSegmentEnv(SegmentEnv):
         except FAILURES as error:
             raise self._failure(index, "recreated after a failure", error) from error
         self._reset(index, seed, out)
-
-    def _not_finite(self, index: int, when: str, row: NDArray[np.float64]) -> SegmentEnvError:
-        entry = int(np.flatnonzero(~np.isfinite(row))[0])
-        name = names_of(self._observation_space)[entry]
-        where = f"{self.task_id}, environment {index}, {when}"
-        return SegmentEnvError(f"{where}: {name} is {row[entry]}")
-
-    def _failure(self, index: int, when: str, error: BaseException) -> SegmentEnvError:
-        failure = SegmentEnvError(
-            f"{self.task_id}, environment {index}, {when}: {type(error).__name__}: {error}"
-        )
-        failure.__cause__ = error
-        return failure
 
 
 def wrapped(env: gymnasium.Env, names: Sequence[str]) -> gymnasium.Env:
