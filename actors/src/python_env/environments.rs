@@ -5,6 +5,7 @@ use std::sync::Arc;
 use dmprl_shared::config::TaskConfig;
 use dmprl_shared::spec::EnvSpec;
 use pyo3::{prelude::*, types::PyTuple};
+use tracing::info;
 
 use super::{Interpreter, PythonError, buffer::SharedBuffer};
 use crate::watchdog::{CallKind, CallState};
@@ -280,6 +281,18 @@ impl PythonEnvironments {
             return Ok(());
         }
         Err(PythonError::Length { task_id: self.spec.id.clone(), name, expected, got })
+    }
+}
+
+impl Drop for PythonEnvironments {
+    /// Closes the environments. Those with processes of their own end them.
+    fn drop(&mut self) {
+        Python::attach(|py| {
+            if let Err(error) = self.env.bind(py).call_method0("close") {
+                let error = PythonError::exception(py, &error);
+                info!("{}: cannot be closed: {error}", self.spec.id);
+            }
+        });
     }
 }
 
