@@ -9,14 +9,21 @@ from __future__ import annotations
 
 import copy
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from dmprl.goal_rule import GoalRule
 from dmprl.segment_env import GoalRows, Goals, NotGoalConditionedError
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
+    AnyEnv = gymnasium.Env | VectorEnv
 
 PROBES = 32
 """Pairs of goals for testing ``compute_reward`` before use."""
@@ -25,15 +32,16 @@ PROBES = 32
 class GymnasiumGoals:
     """The goals of one kind of environment, independent of its instances.
 
-    - ``env``: an environment with a ``Dict`` observation, or any wrapper around it.
-    - ``space``: that ``Dict``.
+    - ``env``: an environment with a ``Dict`` observation, or any wrapper around it; or a vector
+      environment that has the methods itself.
+    - ``space``: that ``Dict``, of one environment.
 
     Raises:
         NotGoalConditionedError: if the observation has no goals, or rewards for other goals are
             unavailable.
     """
 
-    def __init__(self, task_id: str, env: gymnasium.Env, space: spaces.Space) -> None:
+    def __init__(self, task_id: str, env: AnyEnv, space: spaces.Space) -> None:
         self._task_id = task_id
         achieved, desired = self._spaces(space)
         length, self._shape = spaces.flatdim(achieved), achieved.shape
@@ -46,7 +54,7 @@ class GymnasiumGoals:
             "sparse": self._is_sparse(env, achieved, desired),
         }
 
-    def relabel(self, env: gymnasium.Env, rows: GoalRows) -> None:
+    def relabel(self, env: AnyEnv, rows: GoalRows) -> None:
         """Implements :meth:`SegmentEnv.relabel` with ``env``."""
         count = int(rows.count[0])
         achieved, desired = self._shaped(rows.achieved[:count], rows.desired[:count])
@@ -75,12 +83,12 @@ class GymnasiumGoals:
             at += spaces.flatdim(part)
         return first
 
-    def _is_sparse(self, env: gymnasium.Env, achieved: spaces.Box, desired: spaces.Box) -> bool:
+    def _is_sparse(self, env: AnyEnv, achieved: spaces.Box, desired: spaces.Box) -> bool:
         """Returns whether the reward is sparse, after checking that it can be computed.
 
         A reward by distance differs for random pairs; one by threshold has at most two values.
         """
-        if not env.has_wrapper_attr("compute_reward"):
+        if attribute_of(env, "compute_reward") is None:
             raise self._refused(
                 "it has no method compute_reward(achieved_goal, desired_goal, info)"
             )
@@ -93,9 +101,9 @@ class GymnasiumGoals:
         return len(np.unique(rewards)) <= 2
 
     def _rewards(
-        self, env: gymnasium.Env, achieved: NDArray, desired: NDArray, infos: list[dict]
+        self, env: AnyEnv, achieved: NDArray, desired: NDArray, infos: list[dict]
     ) -> NDArray:
-        rewards = np.asarray(env.get_wrapper_attr("compute_reward")(achieved, desired, infos))
+        rewards = np.asarray(attribute_of(env, "compute_reward")(achieved, desired, infos))
         if rewards.shape != (len(achieved),):
             raise self._refused(
                 f"its compute_reward takes one goal at a time: for goals of shape "
@@ -111,14 +119,27 @@ class GymnasiumGoals:
         return NotGoalConditionedError(f"{self._task_id}: {reason}")
 
 
-def terminated_at(env: gymnasium.Env, achieved: NDArray, desired: NDArray) -> Any:
+def attribute_of(env: AnyEnv, name: str, default: Any = None) -> Any:
+    """Returns an attribute of an environment or of one that it wraps, or ``default``."""
+    if isinstance(env, gymnasium.Env):
+        return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else default
+    return getattr(env, name, getattr(env.unwrapped, name, default))
+
+
+def declared_rule(env: AnyEnv, default: Callable[[], GoalRule]) -> GoalRule | None:
+    """Returns the environment's own ``goal_rule``, an attribute or a method, or ``default()``."""
+    declared = attribute_of(env, "goal_rule", default)
+    return declared() if callable(declared) else declared
+
+
+def terminated_at(env: AnyEnv, achieved: NDArray, desired: NDArray) -> Any:
     """Returns for each pair of goals whether the step would have ended its episode.
 
     ``compute_terminated``, if the environment has it, takes one goal at a time. panda-gym does not
     have it; its episodes end at success.
     """
-    if env.has_wrapper_attr("compute_terminated"):
-        ends = env.get_wrapper_attr("compute_terminated")
+    ends = attribute_of(env, "compute_terminated")
+    if ends is not None:
         return [bool(ends(*goals, {})) for goals in zip(achieved, desired, strict=True)]
     panda_gym = sys.modules.get("panda_gym.envs.core")
     if panda_gym and isinstance(env.unwrapped, panda_gym.RobotTaskEnv):

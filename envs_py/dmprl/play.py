@@ -27,7 +27,7 @@ from dmprl.env_options import NO_OPTIONS, EnvOptions
 from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
 from dmprl.pictures import name_opengl
 from dmprl.policy import Policy
-from dmprl.segment_env import SUCCESS_YES, SegmentEnv, named_object
+from dmprl.segment_env import SUCCESS_YES, kind_of_batch, named_object
 from dmprl.task_env import gymnasium_maker
 
 INTERRUPTED = 130
@@ -162,8 +162,9 @@ class Shown(GymnasiumSegmentEnv):
 
     def __init__(self, task_id: str, render_mode: str, options: EnvOptions = NO_OPTIONS) -> None:
         named = named_object(task_id)
-        if isinstance(named, type) and issubclass(named, SegmentEnv):
-            raise SystemExit(f"{task_id} is a SegmentEnv, which cannot be shown")
+        kind = kind_of_batch(named)
+        if kind:
+            raise SystemExit(f"{task_id} is {kind}, which cannot be shown")
         self._mode = render_mode
         super().__init__(task_id, 1, 1, gymnasium_maker(task_id, named, options), options)
 

@@ -31,7 +31,7 @@ from dmprl.env_options import NO_OPTIONS, EnvOptions
 from dmprl.gymnasium_env import GymnasiumSegmentEnv, success_of
 from dmprl.pictures import name_opengl
 from dmprl.robot_joints import Joints, robot_joints
-from dmprl.segment_env import EnvSpec, SegmentBuffers, SegmentEnv, named_object
+from dmprl.segment_env import EnvSpec, SegmentBuffers, SegmentEnv, kind_of_batch, named_object
 from dmprl.task_env import TaskEnv, gymnasium_maker
 
 RENDER_MODE = "rgb_array"
@@ -207,7 +207,7 @@ class RecordingEnv(GymnasiumSegmentEnv):
 
 
 class OpaqueEnv(SegmentEnv):
-    """A user's own :class:`SegmentEnv`, of which only rewards can be recorded."""
+    """Environments that are stepped together, of which only rewards can be recorded."""
 
     def __init__(self, env: SegmentEnv) -> None:
         self._env = env
@@ -238,7 +238,7 @@ class OpaqueEnv(SegmentEnv):
 
     def why_no_joints(self) -> str:
         """Returns the reason."""
-        return "a SegmentEnv runs a whole segment at once, so the motion within is not recorded"
+        return "its environment runs a whole segment at once, so the motion within is not recorded"
 
     def goal_in_pictures(self) -> str:
         """Returns an empty string: there are no pictures."""
@@ -280,9 +280,10 @@ def make(
     if pictures is not None:
         name_opengl()
     named = named_object(task_id)
-    if isinstance(named, type) and issubclass(named, SegmentEnv):
+    kind = kind_of_batch(named)
+    if kind:
         if pictures is not None:
-            raise NoPicturesError(f"{task_id} is a SegmentEnv, which cannot be drawn; {DRAWABLE}")
+            raise NoPicturesError(f"{task_id} is {kind}, which cannot be drawn; {DRAWABLE}")
         return OpaqueEnv(segment_env.make(task_id, 1, segment_steps, options))
     folder = None if pictures is None else Path(pictures)
     maker = gymnasium_maker(task_id, named, options)

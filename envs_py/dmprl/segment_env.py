@@ -8,6 +8,7 @@ of a segment, O observation, A action.
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
 from abc import ABC, abstractmethod
 from types import ModuleType
@@ -164,7 +165,8 @@ class SegmentEnv(ABC):
         - ``actions`` float64 (E, K, A), in environment units.
         - An environment stops at its first terminated or truncated step. It is then reset at the
           end of this call, without a seed: its own random generator continues, so a run depends
-          only on the first seeds. The caller does not reset between episodes.
+          only on the first seeds. :func:`seed_of_episode` is an alternative. The caller does not
+          reset between episodes.
         - An environment that raises an exception or returns NaN or infinity, in a step or in that
           reset, loses only its own segment. It is closed, recreated and reset with
           :func:`seed_after_failure`; ``out.failed`` is set, and its row of
@@ -227,6 +229,16 @@ def seed_after_failure(first_seed: int, failures: int) -> int:
     return int(np.random.SeedSequence([first_seed, failures]).generate_state(1)[0]) >> 1
 
 
+def seed_of_episode(first_seed: int, episode: int) -> int:
+    """Derives the seed of a later episode, for environments that are always reset with a seed.
+
+    - ``first_seed``: seed of the caller's last ``reset``.
+    - ``episode``: number of episodes that have ended since then, including the last one.
+    - Returns 31 bits, as :func:`seed_after_failure` does.
+    """
+    return int(np.random.SeedSequence([first_seed, episode, 1]).generate_state(1)[0]) >> 1
+
+
 def make(
     task_id: str, env_count: int, segment_steps: int, options: EnvOptions = NO_OPTIONS
 ) -> SegmentEnv:
@@ -234,8 +246,8 @@ def make(
 
     - ``task_id``: a Gymnasium id; ``module:Id`` if ``module`` registers the id when it is imported;
       or ``module:name``, where ``name`` is a subclass of :class:`SegmentEnv`,
-      ``dmprl.mujoco_batch.MujocoTask`` or ``gymnasium.Env``, or a function that returns a
-      ``gymnasium.Env``.
+      ``dmprl.mujoco_batch.MujocoTask``, ``gymnasium.Env`` or ``gymnasium.vector.VectorEnv``, or a
+      function that returns a ``gymnasium.Env`` or, with a parameter ``num_envs``, a ``VectorEnv``.
     - ``options``: arguments and wrappers. Environments with wrappers are Gymnasium environments,
       stepped one by one, even those of dmprl's own tasks.
 
@@ -272,8 +284,9 @@ def _make(task_id: str, env_count: int, segment_steps: int, options: EnvOptions)
                     randomise_batch(batch, options.randomise)
                 return batch
 
-        if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
-            raise TypeError("a SegmentEnv cannot be wrapped; expected a gymnasium.Env")
+        batch_kind = kind_of_batch(candidate)
+        if batch_kind:
+            raise TypeError(f"{batch_kind} cannot be wrapped; expected a gymnasium.Env")
 
         # A SegmentEnv works without Gymnasium.
         from dmprl.gymnasium_env import GymnasiumSegmentEnv
@@ -291,6 +304,10 @@ def _make_batch(
     """Creates environments that are stepped together; None for Gymnasium environments."""
     if isinstance(candidate, type) and issubclass(candidate, SegmentEnv):
         return candidate(env_count, segment_steps, **options.kwargs)
+    if makes_vector_env(candidate):
+        from dmprl.vector_env import VectorSegmentEnv
+
+        return VectorSegmentEnv(task_id, env_count, segment_steps, candidate, options)
     batched = sys.modules.get("dmprl.mujoco_batch")  # imported with every subclass of its task
     if batched and isinstance(candidate, type) and issubclass(candidate, batched.MujocoTask):
         batched.quieten_mujoco()
@@ -300,6 +317,24 @@ def _make_batch(
     from dmprl.tasks import make_batch
 
     return make_batch(task_id.removeprefix("dmprl:"), env_count, segment_steps, options)
+
+
+def makes_vector_env(named: object) -> bool:
+    """Returns whether ``named`` is a ``VectorEnv`` or a function with a parameter ``num_envs``."""
+    if isinstance(named, type):
+        vector = sys.modules.get("gymnasium.vector")  # imported with every subclass
+        return vector is not None and issubclass(named, vector.VectorEnv)
+    try:
+        return callable(named) and "num_envs" in inspect.signature(named).parameters
+    except (TypeError, ValueError):  # some callables have no signature
+        return False
+
+
+def kind_of_batch(named: object) -> str:
+    """Describes the object of a task whose environments are stepped together; otherwise empty."""
+    if isinstance(named, type) and issubclass(named, SegmentEnv):
+        return "a SegmentEnv"
+    return "a vector environment" if makes_vector_env(named) else ""
 
 
 def named_object(task_id: str) -> object:

@@ -146,6 +146,32 @@ fn episode_that_terminates_inside_a_segment_keeps_its_true_end() {
     assert_ne!(envs.next_observations()[1], envs.observations()[1]);
 }
 
+/// Environments in processes of their own, and in this one.
+#[test]
+fn vector_environments_give_the_same_segments_in_one_process_and_in_many() {
+    let mut results = Vec::new();
+    for name in ["sync", "in_processes"] {
+        let mut envs = started(&format!("tiny_vectors:{name}"), 3, 5);
+        let mut segments = Vec::new();
+        for segment in 0..20 {
+            let actions: Vec<f64> = (segment * 15..segment * 15 + 15).map(action_at).collect();
+            envs.step_segment(&actions).unwrap();
+            assert_eq!(envs.failed(), [0; 3]);
+            segments.push((
+                (envs.observations().to_vec(), envs.rewards().to_vec(), envs.steps().to_vec()),
+                (envs.terminated().to_vec(), envs.truncated().to_vec(), envs.success().to_vec()),
+                envs.next_observations().to_vec(),
+            ));
+        }
+        results.push(segments);
+    }
+    assert_eq!(results[0], results[1]);
+    let ended = |flags: fn(&(Vec<u8>, Vec<u8>, Vec<u8>)) -> &Vec<u8>| {
+        results[0].iter().any(|(_, ends, _)| flags(ends).contains(&1))
+    };
+    assert!(ended(|ends| &ends.0) && ended(|ends| &ends.1));
+}
+
 /// The message names the place; the log has the traceback with the line of the environment's code.
 #[test]
 fn a_failed_environment_is_named_and_made_again_beside_the_others() {

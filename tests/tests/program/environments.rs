@@ -125,3 +125,55 @@ fn an_environment_that_is_not_there_is_refused_with_a_suggestion() {
     place.assert_no_process();
     assert_eq!(shared_memory_of(&run), Vec::<std::path::PathBuf>::new());
 }
+
+/// Each environment is in a process of its own, and episodes of 8 steps end within segments.
+const VECTOR: &str = "
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+
+class Still(gymnasium.Env):
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.np_random.uniform(size=2), {}
+
+    def step(self, action):
+        self.steps += 1
+        truncated = self.steps == 8
+        return self.np_random.uniform(size=2), 0.5, False, truncated, {'is_success': truncated}
+
+
+def many(num_envs):
+    return gymnasium.vector.AsyncVectorEnv([Still] * num_envs)
+";
+
+#[test]
+fn a_vector_environment_trains_and_leaves_no_process() {
+    let place = Workplace::new();
+    fs::write(place.path("vector.py"), VECTOR).unwrap();
+    let (run, folder) = (place.path("run"), place.path(""));
+    let more = ["--python-path", &folder, "--workers", "1", "--envs-per-worker", "3"];
+    let more = [&more[..], &["--steps", "600"]].concat();
+    place.run(&train("vector:many", &run, &more)).with_status(0);
+    place.until_no_process();
+    let last = rows(&run, "metrics.jsonl").pop().unwrap();
+    assert_eq!(last["env_steps"], 600);
+    assert_eq!((&last["training_return_mean"], &last["env_failures"]), (&4.0.into(), &0.into()));
+    let evaluation = rows(&run, "evaluations.jsonl").pop().unwrap();
+    assert_eq!(evaluation["returns"], serde_json::json!([4.0, 4.0, 4.0, 4.0]));
+    assert_eq!(evaluation["success_rate"], 1.0);
+    place.run(&["eval", &run, "--episodes", "3"]).with_status(0);
+    place
+        .run(&["play", &run])
+        .with_status(1)
+        .saying("vector:many is a vector environment, which cannot be shown");
+    place
+        .run(&["record", &run])
+        .with_status(1)
+        .saying("vector:many is a vector environment, which cannot be drawn");
+}
