@@ -55,7 +55,7 @@ EXAMPLES
 #[command(after_help = HELP)]
 pub(super) struct TrainArgs {
     /// A task of `dmprl tasks`; any Gymnasium id, such as Pendulum-v1 or my_module:MyArm-v0; or
-    /// your own gymnasium.Env or SegmentEnv class, as my_module:MyClass.
+    /// your own gymnasium.Env, VectorEnv or SegmentEnv class, as my_module:MyClass.
     task: String,
     #[command(flatten)]
     configured: ConfiguredArgs,
