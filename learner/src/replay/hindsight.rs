@@ -82,10 +82,10 @@ impl GoalSampler {
     /// Finds the task's region and counts motion in the recent episodes, if that is due. Call it
     /// before a batch is sampled.
     pub fn read_recent(&mut self, replay: &Replay) {
-        let Some(slots) = self.recent.read(replay) else { return };
-        self.region = Region::new(&self.rule, replay, &slots);
+        let Some((recent, kept)) = self.recent.read(replay) else { return };
+        self.region = Region::new(&self.rule, replay, &recent);
         if let Some(motion) = &mut self.motion {
-            motion.count(&self.rule, replay, &slots);
+            motion.read(&self.rule, &self.region, replay, &recent, kept);
         }
     }
 
@@ -117,8 +117,8 @@ impl GoalSampler {
             return 0.0;
         };
         (1..=steps).rev().fold(0.0, |sum, step| {
-            let moves = motion.step_moves(&self.rule, &self.region, replay, window, step);
-            discount * sum + if moves { motion.bonus() } else { 0.0 }
+            let gets = motion.has_bonus(&self.rule, &self.region, replay, window, step);
+            discount * sum + if gets { motion.bonus() } else { 0.0 }
         })
     }
 

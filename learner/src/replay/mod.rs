@@ -12,6 +12,7 @@ mod hindsight;
 mod motion;
 mod recent;
 mod region;
+mod unreached;
 mod window;
 
 use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};

@@ -6,12 +6,17 @@
 //! 2. A step that moves it gets a bonus while fewer than half of the recent episodes moved it. The
 //!    bonus is added when a batch is sampled, so it starts and ends for all windows at once.
 //!
+//! Half of that share and, when it has ended, the bonus then help to reach coordinates that the
+//! task asks for ([`super::unreached`]).
+//!
 //! Windows and bonus are for motion within the region of the task ([`super::region`]), because a
 //! policy that strikes an object as far as it can has not learned to place it.
 
 use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 
+use super::recent::Kept;
 use super::region::Region;
+use super::unreached::Unreached;
 use super::{Replay, Sampler, Window};
 
 /// An episode moves the achieved goal if its end is farther from its start than this many
@@ -22,6 +27,8 @@ const STEP_MOVES: f64 = 0.04;
 /// Share of the recent episodes below which steps get a bonus, and from which on workers explore
 /// less.
 const RARE: f64 = 0.5;
+/// Share of the windows from moving episodes that come from those with unreached coordinates.
+const UNREACHED_SHARE: f64 = 0.5;
 /// Draws after which a window is taken from any episode.
 const DRAWS_MAX: usize = 30;
 
@@ -31,6 +38,7 @@ pub(super) struct Motion {
     threshold: f64,
     /// Share of the windows from episodes that moved the achieved goal.
     share: f64,
+    unreached: Unreached,
     /// Reward of a step that moves the achieved goal, while few episodes do.
     bonus: f32,
     /// Share of the recent episodes that moved the achieved goal; `None` before any has ended.
@@ -43,13 +51,21 @@ impl Motion {
     pub(super) fn new(rule: &GoalRule, share: f64, factor: f64) -> Option<Self> {
         let GoalReward::Sparse { threshold, reached, missed } = rule.reward else { return None };
         let bonus = (factor * (reached - missed)) as f32;
-        Some(Self { threshold, share, bonus, moving: None })
+        let unreached = Unreached::default();
+        Some(Self { threshold, share, unreached, bonus, moving: None })
     }
 
-    /// Counts the episodes that end in one of the recent `slots`.
-    pub(super) fn count(&mut self, rule: &GoalRule, replay: &Replay, slots: &[u32]) {
+    /// Counts the episodes that end in one of the `recent` slots, and finds unreached coordinates.
+    pub(super) fn read(
+        &mut self,
+        rule: &GoalRule,
+        region: &Region,
+        replay: &Replay,
+        recent: &[u32],
+        kept: Kept,
+    ) {
         let (mut ended, mut moved) = (0_u32, 0_u32);
-        for &slot in slots {
+        for &slot in recent {
             let segment = &replay.slots[slot as usize];
             if segment.terminated || segment.truncated {
                 ended += 1;
@@ -57,11 +73,17 @@ impl Motion {
             }
         }
         self.moving = (ended > 0).then(|| f64::from(moved) / f64::from(ended));
+        self.unreached = Unreached::new(rule, region, replay, recent, kept);
     }
 
-    /// Returns the bonus of a step that moves the achieved goal, 0 while many episodes do.
+    /// Returns the bonus of a step that [`Self::has_bonus`], or 0 if no step has it.
     pub(super) fn bonus(&self) -> f32 {
-        if self.moving.is_some_and(|share| share < RARE) { self.bonus } else { 0.0 }
+        let settled_short = self.is_settled() && self.unreached.any();
+        if self.moving.is_some_and(|share| share < RARE) || settled_short {
+            self.bonus
+        } else {
+            0.0
+        }
     }
 
     /// Returns whether many recent episodes moved the achieved goal.
@@ -70,7 +92,7 @@ impl Motion {
     }
 
     /// Draws a window, with probability `share` from an episode that moved the achieved goal and
-    /// ended in the region.
+    /// ended in the region. Half of these are from episodes that reached unreached coordinates.
     pub(super) fn draw(
         &self,
         rule: &GoalRule,
@@ -81,6 +103,11 @@ impl Motion {
         let mut window = sampler.draw(replay)?;
         if !sampler.flip(self.share) {
             return Some(window);
+        }
+        if self.unreached.any() && sampler.flip(UNREACHED_SHARE) {
+            if let Some(reaching) = self.unreached.draw(replay, sampler) {
+                return Some(reaching);
+            }
         }
         for _ in 1..DRAWS_MAX {
             if self.moved(rule, replay, window.slot).is_some_and(|end| region.contains(end)) {
@@ -95,15 +122,15 @@ impl Motion {
     fn moved<'a>(&self, rule: &GoalRule, replay: &'a Replay, slot: u32) -> Option<&'a [f32]> {
         let live = replay.live(slot);
         let first = replay.slot_at(live.newest, live.first_rank)?;
-        let steps = usize::from(replay.slots[live.newest as usize].steps_len);
         let start = rule.achieved(replay.observation_row(first, 0));
-        let end = rule.achieved(replay.observation_row(live.newest, steps));
+        let end = rule.achieved(replay.last_row(live.newest));
         (rule.distance(start, end) > EPISODE_MOVES * self.threshold).then_some(end)
     }
 
-    /// Returns whether step `step` of a window, counted from 1, moves the achieved goal and leaves
-    /// it in the region.
-    pub(super) fn step_moves(
+    /// Returns whether step `step` of a window, counted from 1, gets the bonus: it moves the
+    /// achieved goal and leaves it in the region or, once episodes do, leaves it in an unreached
+    /// coordinate.
+    pub(super) fn has_bonus(
         &self,
         rule: &GoalRule,
         region: &Region,
@@ -111,8 +138,11 @@ impl Motion {
         window: &Window,
         step: usize,
     ) -> bool {
-        let before = rule.achieved(replay.observation_after(window, step - 1));
         let after = rule.achieved(replay.observation_after(window, step));
+        if self.is_settled() {
+            return self.unreached.contains(region, after);
+        }
+        let before = rule.achieved(replay.observation_after(window, step - 1));
         rule.distance(before, after) > STEP_MOVES * self.threshold && region.contains(after)
     }
 }
@@ -137,8 +167,8 @@ mod tests {
 
     /// Inserts an episode of two segments that achieves 0, 0, `step`, `step`, `step`.
     fn episode(replay: &mut Replay, number: u32, step: f32) {
-        let first = [0.0, 9.0, 0.0, 9.0, step, 9.0, 0.1, 0.2, -2.0, -2.0];
-        let second = [step, 9.0, step, 9.0, step, 9.0, 0.1, 0.2, -2.0, -2.0];
+        let first = [0.0, 0.3, 0.0, 0.3, step, 0.3, 0.1, 0.2, -2.0, -2.0];
+        let second = [step, 0.3, step, 0.3, step, 0.3, 0.1, 0.2, -2.0, -2.0];
         for (block, episode_step, flags) in [(first, 0, 0), (second, 2, TRUNCATED)] {
             let header = SegmentHeader {
                 episode: number,
@@ -157,8 +187,8 @@ mod tests {
 
     /// Counts the recent episodes, if that is due.
     fn count(motion: &mut Motion, recent: &mut Recent, replay: &Replay) {
-        if let Some(slots) = recent.read(replay) {
-            motion.count(&rule(), replay, &slots);
+        if let Some((slots, kept)) = recent.read(replay) {
+            motion.read(&rule(), &Region::default(), replay, &slots, kept);
         }
     }
 
@@ -241,12 +271,12 @@ mod tests {
         let region = region(&replay);
         let moves = |slot, step| {
             let window = replay.window(slot, 1).unwrap();
-            motion(0.0).step_moves(&rule(), &region, &replay, &window, step)
+            motion(0.0).has_bonus(&rule(), &region, &replay, &window, step)
         };
         assert_eq!([moves(0, 1), moves(0, 2), moves(2, 1)], [true, false, false]);
     }
 
-    /// Returns the region of all segments: 0 to 9 and a threshold more.
+    /// Returns the region of all segments: 0 to 0.3 and a threshold more.
     fn region(replay: &Replay) -> Region {
         let slots: Vec<u32> = (0..replay.len() as u32).collect();
         Region::new(&rule(), replay, &slots)

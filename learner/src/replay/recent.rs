@@ -3,7 +3,7 @@
 use super::Replay;
 
 /// Number of newest segments that are read.
-const RECENT_SEGMENTS: u64 = 600;
+const RECENT_SEGMENTS: usize = 600;
 /// Inserted segments between two readings.
 const READ_EVERY: u64 = 100;
 
@@ -15,10 +15,10 @@ pub(super) struct Recent {
 }
 
 impl Recent {
-    /// Returns the slots of the newest segments, newest first, if a reading is due. They are
-    /// segments that a replay still has when the next reading is due, so a resumed run reads the
-    /// same ones.
-    pub(super) fn read(&mut self, replay: &Replay) -> Option<Vec<u32>> {
+    /// Returns the slots of the newest segments, newest first, and of all that may be read, if a
+    /// reading is due. A replay still has these when the next reading is due, so a resumed run
+    /// reads the same ones.
+    pub(super) fn read(&mut self, replay: &Replay) -> Option<(Vec<u32>, Kept)> {
         let inserted = replay.inserted - replay.inserted % READ_EVERY;
         if inserted < self.due {
             return None;
@@ -29,8 +29,23 @@ impl Recent {
         // Of each environment's episode the start may have been replaced. Its oldest segment is
         // left out, because a replay that is read from a file takes it for the start.
         let kept = ring.saturating_sub(READ_EVERY + replay.tails.len() as u64);
-        let recent = RECENT_SEGMENTS.min(kept).min(inserted);
-        Some((newest..newest + recent).map_while(|back| replay.slot_before(back)).collect())
+        let kept = Kept { newest, len: kept.min(inserted) };
+        let recent = kept.slots(replay).take(RECENT_SEGMENTS).collect();
+        Some((recent, kept))
+    }
+}
+
+/// Segments of the ring that may be read, as numbers of later segments.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Kept {
+    newest: u64,
+    len: u64,
+}
+
+impl Kept {
+    /// Returns their slots, newest first.
+    pub(super) fn slots(self, replay: &Replay) -> impl Iterator<Item = u32> {
+        (self.newest..self.newest + self.len).map_while(|back| replay.slot_before(back))
     }
 }
 

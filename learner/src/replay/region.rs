@@ -41,7 +41,7 @@ impl Region {
 }
 
 /// Widens ranges to include a goal. Ranges without an entry become that goal.
-fn widen(ranges: &mut Vec<[f32; 2]>, goal: &[f32]) {
+pub(super) fn widen(ranges: &mut Vec<[f32; 2]>, goal: &[f32]) {
     if ranges.is_empty() {
         ranges.extend(goal.iter().map(|&value| [value, value]));
     }

@@ -106,6 +106,11 @@ impl Replay {
         &observations[row * len..(row + 1) * len]
     }
 
+    /// Returns the observation after a slot's last step, (O,).
+    pub(super) fn last_row(&self, slot: u32) -> &[f32] {
+        self.observation_row(slot, usize::from(self.slots[slot as usize].steps_len))
+    }
+
     /// Copies the window's actions, (n, A), to the front of `out`, (K, A), and zeros the rest.
     pub fn actions(&self, window: &Window, out: &mut [f32]) {
         let dims = self.layout.action_len;
@@ -213,15 +218,20 @@ impl Sampler {
         }
         (0..TRIES_MAX).find_map(|_| {
             let slot = self.random.random_range(0..slots as u32) as usize;
-            let offset = match self.windows {
-                Windows::Segment => 0,
-                Windows::Sliding if replay.slots[slot].hindsight => 0,
-                Windows::Sliding => {
-                    self.random.random_range(0..replay.layout().segment_steps as u32) as usize
-                }
-            };
-            replay.window(slot, offset)
+            self.draw_in(replay, slot)
         })
+    }
+
+    /// Draws one of the windows that may begin in a slot, or `None` if a drawn step begins none.
+    pub(super) fn draw_in(&mut self, replay: &Replay, slot: usize) -> Option<Window> {
+        let offset = match self.windows {
+            Windows::Segment => 0,
+            Windows::Sliding if replay.slots[slot].hindsight => 0,
+            Windows::Sliding => {
+                self.random.random_range(0..replay.layout().segment_steps as u32) as usize
+            }
+        };
+        replay.window(slot, offset)
     }
 }
 

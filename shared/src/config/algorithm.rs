@@ -84,7 +84,8 @@ pub struct AlgorithmConfig {
     /// Reward of a step that moves the achieved goal and leaves it in the region of desired goals
     /// and starts, in units of the reward of reaching a goal. It is added while less than half of
     /// the recent episodes move it, if goals are drawn when a batch is sampled and the reward is
-    /// sparse.
+    /// sparse. Afterwards it is the reward of a step that ends away in a coordinate of the goals
+    /// that is unreached, such as the height (docs/algorithm.md).
     pub motion_bonus: f64,
     /// Whether the critics of DDPG, TD3 and SAC also see how far from the desired goal a model
     /// expects the achieved goal after each step of the segment. The model learns from the same

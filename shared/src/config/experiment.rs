@@ -119,7 +119,9 @@ pub struct ReplayConfig {
     pub hindsight_share: f64,
     /// Share of a batch's windows that come from episodes in which the achieved goal moved and
     /// stayed in the region of desired goals and starts, if goals are drawn when a batch is sampled
-    /// and the reward is sparse. Where few episodes did, the share may be smaller.
+    /// and the reward is sparse. Where few episodes did, the share may be smaller. While a
+    /// coordinate of the goals is unreached, half of them come from episodes that went away in it
+    /// (docs/algorithm.md).
     pub moved_share: f64,
     /// Hindsight copies per segment, each with its own goal, if workers make copies.
     pub hindsight_copies: usize,

@@ -1,0 +1,202 @@
+//! Coordinates of the goal that the task asks for and the policy does not reach, such as the height
+//! of a cube that it pushes and never lifts.
+//!
+//! A goal is *away* in a coordinate if it is outside the range in which episodes start. A
+//! coordinate is unreached if many desired goals are away in it, and few segments end there. Two
+//! remedies, which are our own:
+//! 1. Windows are drawn from the episodes that went away in it, even if there are only a few.
+//! 2. Steps that end there get the bonus for motion, once motion itself no longer has it.
+//!
+//! Both end when segments end there often enough, for all windows at once.
+
+use dmprl_shared::goal_rule::{GoalReward, GoalRule};
+use rand::RngExt;
+
+use super::recent::Kept;
+use super::region::{self, Region};
+use super::{Replay, Sampler, Window};
+
+/// A goal is away if it is more than this many thresholds outside the range of the starts.
+const MARGIN: f32 = 0.4;
+/// Share of the desired goals that must be away.
+const MANY: f64 = 0.1;
+/// Share of the segments below which few end away, relative to that of the desired goals.
+const FEW: f64 = 0.3;
+/// Draws after which a window is taken from another episode.
+const DRAWS_MAX: usize = 20;
+
+/// A coordinate of the goal, with the range outside which it is away.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Coordinate {
+    index: usize,
+    low: f32,
+    high: f32,
+}
+
+impl Coordinate {
+    /// Returns whether a goal, (G,), is away.
+    fn is_away(self, goal: &[f32]) -> bool {
+        !(self.low..=self.high).contains(&goal[self.index])
+    }
+}
+
+/// The unreached coordinates, and the segments that went away in them.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Unreached {
+    coordinates: Vec<Coordinate>,
+    /// Slots of segments that end away, within the region, newest first.
+    slots: Vec<u32>,
+}
+
+impl Unreached {
+    /// Finds the coordinates from the `recent` slots, and the segments among the `kept` ones.
+    pub(super) fn new(
+        rule: &GoalRule,
+        region: &Region,
+        replay: &Replay,
+        recent: &[u32],
+        kept: Kept,
+    ) -> Self {
+        let GoalReward::Sparse { threshold, .. } = rule.reward else { return Self::default() };
+        let mut starts = Vec::new();
+        for &slot in recent.iter().filter(|&&slot| replay.rank(slot) == 0) {
+            region::widen(&mut starts, rule.achieved(replay.observation_row(slot, 0)));
+        }
+        let margin = MARGIN * threshold as f32;
+        let coordinates = starts.iter().enumerate().map(|(index, range)| Coordinate {
+            index,
+            low: range[0] - margin,
+            high: range[1] + margin,
+        });
+        let coordinates = coordinates.filter(|&coordinate| {
+            let desired =
+                |&&slot: &&u32| coordinate.is_away(rule.desired(replay.observation_row(slot, 0)));
+            let achieved = |&&slot: &&u32| {
+                let goal = rule.achieved(replay.last_row(slot));
+                coordinate.is_away(goal) && region.contains(goal)
+            };
+            let asked = recent.iter().filter(desired).count() as f64;
+            let reached = recent.iter().filter(achieved).count() as f64;
+            asked > MANY * recent.len() as f64 && reached < FEW * asked
+        });
+        let mut unreached = Self { coordinates: coordinates.collect(), slots: Vec::new() };
+        if unreached.any() {
+            let is_away =
+                |&slot: &u32| unreached.contains(region, rule.achieved(replay.last_row(slot)));
+            unreached.slots = kept.slots(replay).filter(is_away).collect();
+        }
+        unreached
+    }
+
+    /// Returns whether there is an unreached coordinate.
+    pub(super) fn any(&self) -> bool {
+        !self.coordinates.is_empty()
+    }
+
+    /// Returns whether a goal, (G,), is away in an unreached coordinate, within the region.
+    pub(super) fn contains(&self, region: &Region, goal: &[f32]) -> bool {
+        self.coordinates.iter().any(|&coordinate| coordinate.is_away(goal)) && region.contains(goal)
+    }
+
+    /// Draws a window from an episode that went away, or returns `None` if there is none.
+    pub(super) fn draw(&self, replay: &Replay, sampler: &mut Sampler) -> Option<Window> {
+        if self.slots.is_empty() {
+            return None;
+        }
+        (0..DRAWS_MAX).find_map(|_| {
+            let random = sampler.random_mut();
+            let live = replay.live(self.slots[random.random_range(0..self.slots.len())]);
+            let rank = random.random_range(live.first_rank..=live.last_rank);
+            let slot = replay.slot_at(live.newest, rank)?;
+            sampler.draw_in(replay, slot as usize)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::config::Windows;
+    use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TRUNCATED};
+
+    use super::super::recent::Recent;
+    use super::*;
+    use crate::learner::tests::goal_rule;
+
+    /// Observations are (achieved goal, desired goal).
+    const LAYOUT: SegmentLayout =
+        SegmentLayout { segment_steps: 1, observation_len: 2, action_len: 1 };
+
+    fn rule() -> GoalRule {
+        let reward = GoalReward::Sparse { threshold: 1.0, reached: 0.0, missed: -1.0 };
+        GoalRule { reward, ..goal_rule() }
+    }
+
+    /// Inserts episodes of two segments that start at 0, rise to `peak`, and end at 0.
+    fn replay(episodes: impl IntoIterator<Item = (f32, f32)>) -> Replay {
+        let mut replay = Replay::new(LAYOUT, 1_000, 1, 1);
+        for (episode, (peak, desired)) in episodes.into_iter().enumerate() {
+            for (step, [before, after]) in [[0.0, peak], [peak, 0.0]].into_iter().enumerate() {
+                let header = SegmentHeader {
+                    episode: episode as u32,
+                    episode_step: step as u32,
+                    steps_len: 1,
+                    flags: if step == 1 { TRUNCATED } else { 0 },
+                    ..SegmentHeader::default()
+                };
+                replay.insert(&header, &[before, desired, after, desired, 0.1, -1.0]);
+            }
+        }
+        replay
+    }
+
+    fn unreached(replay: &Replay) -> Unreached {
+        let (recent, kept) = Recent::default().read(replay).unwrap();
+        let region = Region::new(&rule(), replay, &recent);
+        Unreached::new(&rule(), &region, replay, &recent, kept)
+    }
+
+    #[test]
+    fn a_coordinate_is_unreached_while_the_task_asks_for_it_and_few_segments_end_there() {
+        // Of 100 episodes 20 shall go to 5. A peak of 0.4 is within the margin.
+        let episodes = |peaks: usize, peak: f32| {
+            let desired = |episode| if episode < 20 { 5.0 } else { 0.0 };
+            replay(
+                (0..100)
+                    .map(|n| (if n % 5 == 0 && n < 5 * peaks { peak } else { 0.0 }, desired(n))),
+            )
+        };
+        let is_unreached = |peaks, peak| unreached(&episodes(peaks, peak)).any();
+        // 20 % of the segments are asked to be away, so fewer than 12 of 200 are few.
+        assert!(is_unreached(0, 5.0) && is_unreached(11, 5.0));
+        assert!(!is_unreached(12, 5.0));
+        assert!(is_unreached(12, 0.4), "not away");
+        assert!(is_unreached(12, 50.0), "not in the region");
+        let seldom = replay((0..100).map(|n| (0.0, if n < 10 { 5.0 } else { 0.0 })));
+        assert!(!unreached(&seldom).any(), "hardly asked for");
+        assert!(!Unreached::default().any());
+    }
+
+    #[test]
+    fn windows_are_drawn_from_all_segments_of_the_episodes_that_went_away() {
+        let replay = replay((0..100).map(|n| (if n == 7 { 4.0 } else { 0.0 }, 5.0)));
+        let random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut sampler = Sampler::new(Windows::Sliding, random);
+        let unreached = unreached(&replay);
+        assert_eq!(unreached.slots, [14]);
+        let mut drawn = [0; 2];
+        for _ in 0..200 {
+            let window = unreached.draw(&replay, &mut sampler).unwrap();
+            drawn[window.slot as usize - 14] += 1;
+        }
+        assert!(drawn[0] > 60 && drawn[1] > 60, "{drawn:?}");
+        assert_eq!(Unreached::default().draw(&replay, &mut sampler), None);
+    }
+
+    #[test]
+    fn only_goals_in_the_region_that_are_away_are_contained() {
+        let replay = replay((0..100).map(|_| (0.0, 5.0)));
+        let region = Region::new(&rule(), &replay, &[0, 1]);
+        let contains = |goal| unreached(&replay).contains(&region, &[goal]);
+        assert_eq!([0.3, 0.5, 5.9, 6.1].map(contains), [false, true, true, false]);
+    }
+}
