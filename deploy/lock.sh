@@ -46,7 +46,7 @@ project=envs_py/pyproject.toml
 { requirements $project project dependencies; requirements $project build-system requires; } |
     lock envs_py/locks/base.txt
 # The optional parts that dmprl installs by itself.
-for extra in search video; do
+for extra in demos search video; do
     requirements $project project optional-dependencies $extra |
         lock envs_py/locks/$extra.txt --constraint envs_py/locks/base.txt
 done
