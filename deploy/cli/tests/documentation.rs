@@ -199,6 +199,8 @@ fn every_flag_that_is_shown_exists() {
         "sweep",
         "report",
         "dashboard",
+        "demos show",
+        "demos convert",
         "record",
         "export",
         "play",

@@ -8,6 +8,7 @@
 //! videos/  plots/                                          lock  lease.N       held while running
 //! motion.json        motion of the latest policy, measured on request
 //! processes.json     state of each process, during training
+//! demonstrations-N.npz  converted from a data set of another format when the run was created
 //! segments.log       segments since the last checkpoint, at delivery level `log`
 //! provenance.json    proof that this user made the run, if it needs code of the user's own
 //! ```

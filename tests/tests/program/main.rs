@@ -22,6 +22,7 @@ mod dashboard;
 mod dashboard_page;
 mod deaths;
 mod delivery;
+mod demos;
 mod determinism;
 mod documents;
 mod endings;

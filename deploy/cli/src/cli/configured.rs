@@ -10,6 +10,7 @@ use dmprl_shared::config::{Device, ExperimentConfig, PRESETS, suitable_preset};
 use toml::Value;
 
 use super::configuration::{Flag, Sources};
+use super::demos::is_foreign;
 
 /// Arguments that determine the configuration.
 #[derive(Debug, Args)]
@@ -121,7 +122,7 @@ impl ConfiguredArgs {
 
 /// Returns the folder in the Python project `project` from which the module of `task` is imported:
 /// the project's own or its `src`.
-fn project_folder(project: &Path, task: &str) -> Option<PathBuf> {
+pub(super) fn project_folder(project: &Path, task: &str) -> Option<PathBuf> {
     let (module, _) = task.split_once(':')?;
     let first = module.split('.').next().filter(|name| !name.is_empty())?;
     let has_module = |folder: &PathBuf| {
@@ -162,7 +163,7 @@ pub(super) fn make_absolute(config: &mut ExperimentConfig) -> anyhow::Result<()>
         *path = absolute_folder(path)?;
     }
     for path in &mut config.demonstrations.files {
-        *path = absolute_file(path)?;
+        *path = absolute_file(path, &config.task.name)?;
     }
     Ok(())
 }
@@ -186,7 +187,13 @@ fn absolute_folder(path: &str) -> anyhow::Result<String> {
     text(absolute)
 }
 
-fn absolute_file(path: &str) -> anyhow::Result<String> {
+fn absolute_file(path: &str, task: &str) -> anyhow::Result<String> {
+    if is_foreign(path) {
+        return Err(wrong_use(format!(
+            "demonstrations {path}: expected a file here, because only `dmprl train` converts \
+             other formats; convert it with: dmprl demos convert {path} demos.npz --task {task}"
+        )));
+    }
     let absolute = std::fs::canonicalize(path)
         .map_err(|error| wrong_use(format!("demonstrations {path}: {error}")))?;
     if !absolute.is_file() {
@@ -202,7 +209,7 @@ fn text(absolute: PathBuf) -> anyhow::Result<String> {
 
 /// Collects environment variables. Skips variables that are not UTF-8, but rejects those with the
 /// prefix `DMPRL_`.
-fn environment() -> anyhow::Result<Vec<(String, String)>> {
+pub(super) fn environment() -> anyhow::Result<Vec<(String, String)>> {
     let mut texts = Vec::new();
     for (name, value) in std::env::vars_os() {
         let Ok(name) = name.into_string() else { continue };

@@ -14,6 +14,7 @@ mod completions;
 mod configuration;
 mod configured;
 mod dashboard;
+mod demos;
 mod doctor;
 mod env;
 mod eval;
@@ -100,6 +101,8 @@ enum Command {
     Report(report::ReportArgs),
     /// Show runs on a web page, during and after training.
     Dashboard(dashboard::DashboardArgs),
+    /// Show and convert demonstrations, also of Minari and LeRobot.
+    Demos(demos::DemosArgs),
     /// Make a video of a policy, or of two side by side.
     Record(record::RecordArgs),
     /// Play a policy live, in a window or in a browser.
@@ -206,6 +209,7 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Sweep(args) => sweep::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Dashboard(args) => dashboard::run(&args),
+        Command::Demos(args) => demos::run(&args),
         Command::Record(args) => record::run(&args),
         Command::Play(args) => play::run(&args),
         Command::Export(args) => export::run(&args),

@@ -20,6 +20,7 @@ use toml::Value;
 
 use super::configuration::{Flag, merge, refuse};
 use super::configured::{ConfiguredArgs, check_build, flag, integer, make_absolute, paths};
+use super::demos::ForeignSources;
 use super::output::OutputArgs;
 use super::trust::{Said, TrustArgs, mark_as_own};
 use super::{
@@ -46,6 +47,7 @@ EXAMPLES
   dmprl train reacher --config runs/baseline/config.toml --deterministic
   dmprl train reacher --init-from runs/baseline --seed 3
   dmprl train panda-reach --demos demos.npz
+  dmprl train my_module:MyPen-v0 --demos minari:D4RL/pen/human-v2
   dmprl train my_module:MyArm-v0 --python-path ./envs
   dmprl train gymnasium_robotics:FetchReach-v4 --env-kwargs reward_type=dense
   dmprl train my_module:MyArm --python-path ./envs --env-kwargs 'gains=[1.0, 2.5]'";
@@ -78,8 +80,9 @@ pub(super) struct TrainArgs {
     /// Initialise the policy from a run's best policy or from a policy file.
     #[arg(long, value_name = "RUN|FILE")]
     init_from: Option<PathBuf>,
-    /// Demonstrations to learn from, a file of steps (docs/demonstrations.md); repeatable.
-    #[arg(long, value_name = "FILE")]
+    /// Demonstrations to learn from: a file of steps, or a data set of Minari (minari:ID or a
+    /// folder) or LeRobot (a folder), converted as by `dmprl demos convert`; repeatable.
+    #[arg(long, value_name = "SOURCE")]
     demos: Vec<PathBuf>,
     /// Stop when the mean evaluation return reaches this value.
     #[arg(long, value_name = "X", allow_negative_numbers = true)]
@@ -104,15 +107,23 @@ pub(super) struct TrainArgs {
 
 /// Resolves and checks the configuration that these arguments determine.
 pub(super) fn configuration(args: &TrainArgs) -> anyhow::Result<ExperimentConfig> {
-    let sources = args.configured.sources(&args.task, flags(args)?)?;
-    let mut config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
-    check(&config, args)?;
+    let mut config = resolved(args)?;
     make_absolute(&mut config)?;
     Ok(config)
 }
 
+/// As [`configuration`], with paths as they were given.
+fn resolved(args: &TrainArgs) -> anyhow::Result<ExperimentConfig> {
+    let sources = args.configured.sources(&args.task, flags(args)?)?;
+    let config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    check(&config, args)?;
+    Ok(config)
+}
+
 pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
-    let config = configuration(args)?;
+    let mut config = resolved(args)?;
+    let mut foreign = ForeignSources::take(&mut config);
+    make_absolute(&mut config)?;
     let said = Said {
         task: &args.task,
         file: args.configured.config.as_deref(),
@@ -127,9 +138,11 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     }
     let venv = prepare_python()?;
     let path = args.run_dir.clone().map_or_else(|| default_path(&config), Ok)?;
+    foreign.convert(&mut config, &path)?;
     let session = training_session(&config, &venv)?;
     let manifest = Manifest::begin(init_from.map(|path| path.display().to_string()), session)?;
     let run = RunDirectory::create(&path, &config, &manifest)?;
+    foreign.move_to(run.path())?;
     mark_as_own(&run, &config);
     name_limits(&run);
     let lock = run.lock(Duration::ZERO)?;
