@@ -183,6 +183,7 @@ class DemosTest(unittest.TestCase):
         self.refused("no column pose", there_are, observation=("pose",))
         self.refused("no column torque", there_are, action="torque")
         self.refused("--reward state", "a column of length 1", reward="state")
+        self.refused("--reward 1e39", "a finite 32-bit number", reward="1e39")
         lengths = "expects 4 entries, got 5 from state, grip", "choose columns with --observation"
         five = FakeSource(episode(observation_len=5))
         self.refused(*lengths, source=five, task=REACH, observation=("state", "grip"))

@@ -32,13 +32,20 @@ class Wishes(NamedTuple):
     """Maximum number of episodes."""
 
     def reward_number(self, source: Source) -> float | None:
-        """Returns the reward of every step, if it is a number."""
+        """Returns the reward of every step, if it is a number.
+
+        :raises DemosError: if it is NaN or infinite in 32 bits.
+        """
         if self.reward is None or self.reward in source.columns:
             return None
         try:
-            return float(self.reward)
+            number = float(self.reward)
         except ValueError:
             return None
+        with np.errstate(over="ignore"):
+            if not np.isfinite(np.float32(number)):
+                raise DemosError(f"--reward {self.reward}: expected a finite 32-bit number")
+        return number
 
 
 class Conversion:

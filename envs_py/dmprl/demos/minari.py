@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -116,8 +117,8 @@ def folder_of_id(name: str, dataset_id: str) -> Path:
     if not (folder / METADATA).is_file():
         raise DemosError(
             f"{name}: Minari's local store has no data set {dataset_id} (looked in {folder}); "
-            f"download it with: dmprl env add 'minari[hf]' && .venv/bin/minari download "
-            f"{dataset_id}"
+            f"download it with: dmprl env add 'minari[hf]' && "
+            f"{Path(sys.executable).with_name('minari')} download {dataset_id}"
         )
     return folder
 
