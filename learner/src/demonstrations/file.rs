@@ -161,11 +161,14 @@ impl Archive<'_> {
     ) -> Result<Vec<f32>, DemonstrationError> {
         for (at, &action) in actions.values.iter().enumerate() {
             let (row, dimension) = (at / actions.width, at % actions.width);
-            let (low, high) = (spec.action_low[dimension], spec.action_high[dimension]);
+            let [low, high] = scaling.bounds(dimension);
             let slack = ROUNDING * (high - low);
             if !(low - slack..=high + slack).contains(&action) {
                 let place = format!("actions, row {row} entry {dimension}");
-                let bounds = format!("the environment's own units, {low} to {high}");
+                let mut bounds = format!("the environment's own units, {low} to {high}");
+                if high < spec.action_high[dimension] {
+                    bounds.push_str(", a part of its bounds (policy.action_range = 1 is all)");
+                }
                 return Err(self.invalid(place, bounds, action.to_string()));
             }
         }

@@ -74,11 +74,24 @@ fn learner(keys: &[(&str, &str)]) -> Learner {
 }
 
 fn read(arrays: &Arrays) -> Result<Demonstration, DemonstrationError> {
+    read_for(&learner(&[]), arrays)
+}
+
+fn read_for(learner: &Learner, arrays: &Arrays) -> Result<Demonstration, DemonstrationError> {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("demos.npz");
     let named: Vec<_> = arrays.iter().map(|(name, tensor)| (*name, tensor)).collect();
     Tensor::write_npz(&named, &path).unwrap();
-    Demonstration::read(&path, &crate::learner::tests::spec(), learner(&[]).policy())
+    Demonstration::read(&path, &crate::learner::tests::spec(), learner.policy())
+}
+
+#[test]
+fn actions_outside_the_share_that_the_policy_uses_are_refused() {
+    let learner = learner(&[("policy.action_range", "0.5")]);
+    let message = read_for(&learner, &arrays()).unwrap_err().to_string();
+    for word in ["actions, row 0 entry 0", "-0.5 to 0.5", "policy.action_range", "got -1"] {
+        assert!(message.contains(word), "{word}: {message}");
+    }
 }
 
 #[test]

@@ -24,6 +24,13 @@ impl ActionScaling {
         }
     }
 
+    /// Returns the smallest and the largest action of a dimension, in the environment's units.
+    #[must_use]
+    pub fn bounds(&self, dimension: usize) -> [f64; 2] {
+        let half_range = self.half_range[dimension];
+        [-half_range, half_range].map(|distance| self.mid[dimension] + distance)
+    }
+
     /// Clips and scales `u`, (rows, A), into `actions`, (rows, A) in the environment's units.
     pub fn apply(&self, u: &[f32], actions: &mut [f64]) {
         let dims = self.mid.len();
