@@ -102,7 +102,8 @@ pub struct OpenedPolicy {
 pub enum Match {
     /// The same architecture: configuration, DMP, task and sizes.
     Architecture,
-    /// The same network sizes, for a warm start under another configuration.
+    /// The same network sizes and share of the action range, for a warm start under another
+    /// configuration.
     Sizes,
 }
 
@@ -268,6 +269,8 @@ impl<'a> Contents<'a> {
     ) -> Result<ParameterSnapshot, PolicyFileError> {
         if strictness == Match::Architecture {
             self.expect(HASH_KEY, format!("{:016x}", policy.architecture_hash()))?;
+        } else {
+            self.check_action_range(policy)?;
         }
         let mut tensors = Vec::new();
         for (name, shape, range) in names(policy) {
@@ -294,6 +297,22 @@ impl<'a> Contents<'a> {
             settled: false,
             values,
         })
+    }
+
+    /// Checks that the file's policy uses the same share of the action range: otherwise all its
+    /// actions would be scaled.
+    fn check_action_range(&self, policy: &Policy) -> Result<(), PolicyFileError> {
+        let text = self.fields.get(DESCRIPTION_KEY).map_or("null", String::as_str);
+        let description: serde_json::Value =
+            serde_json::from_str(text).map_err(|error| format_error(self.path, error))?;
+        // Older files have no such key.
+        let got = description["policy"]["action_range"].as_f64().unwrap_or(1.0);
+        let expected = policy.description().policy.action_range;
+        if got == expected {
+            return Ok(());
+        }
+        let expected = format!("{expected}, as configured (--set policy.action_range={got})");
+        Err(self.mismatch("policy.action_range", expected, got.to_string()))
     }
 
     fn field(&self, name: &str) -> String {

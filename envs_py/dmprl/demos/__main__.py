@@ -32,6 +32,7 @@ def arguments_of(words: list[str]) -> argparse.Namespace:
     parser.add_argument("output", nargs="?", type=Path)
     parser.add_argument("--task")
     parser.add_argument("--options", type=EnvOptions.parse, default=NO_OPTIONS, help="TOML")
+    parser.add_argument("--action-range", type=float, default=1.0)
     parser.add_argument("--python-path", action="append", default=[])
     parser.add_argument("--observation", type=lambda text: tuple(text.split(",")), default=())
     parser.add_argument("--action-column")
@@ -62,7 +63,8 @@ def main(words: list[str]) -> int:
         source = open_source(arguments.source)
         task = None
         if arguments.task is not None:
-            task = Task(SHORT_NAMES.get(arguments.task, arguments.task), arguments.options)
+            task_id = SHORT_NAMES.get(arguments.task, arguments.task)
+            task = Task(task_id, arguments.options, arguments.action_range)
         if arguments.action == "show":
             result = summary.summarise(source, task, wishes)
             text = summary.text_of(result)

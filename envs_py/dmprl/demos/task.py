@@ -16,9 +16,14 @@ ROUNDING = 1e-5
 
 
 class Task:
-    """Sizes, bounds, control rate and goals of a task."""
+    """Sizes, bounds, control rate and goals of a task.
 
-    def __init__(self, task_id: str, options: EnvOptions = NO_OPTIONS) -> None:
+    Its bounds are those of policies that use the share ``action_range`` of its actions.
+    """
+
+    def __init__(
+        self, task_id: str, options: EnvOptions = NO_OPTIONS, action_range: float = 1.0
+    ) -> None:
         try:
             self._env = make(task_id, 1, 1, options)
             self.spec: EnvSpec = self._env.spec()
@@ -27,6 +32,12 @@ class Task:
                 f"task {task_id} cannot be created: {type(error).__name__}: {error}"
             ) from error
         self.id = self.spec["id"]
+        low, high = np.array(self.spec["action_low"]), np.array(self.spec["action_high"])
+        middle, half = 0.5 * (low + high), 0.5 * action_range * (high - low)
+        self.action_low, self.action_high = middle - half, middle + half
+        self.bounds_name = f"the bounds of {self.id}"
+        if action_range < 1.0:
+            self.bounds_name = f"{action_range:g} of {self.bounds_name} (policy.action_range)"
         control_dt_s = self.spec["control_dt_s"]
         self.rate_hz = 1.0 / control_dt_s if control_dt_s > 0.0 else 0.0
         try:
@@ -159,13 +170,13 @@ def check(
             )
     if task is None:
         return
-    low, high = np.array(task.spec["action_low"]), np.array(task.spec["action_high"])
+    low, high = task.action_low, task.action_high
     slack = ROUNDING * (high - low)
     outside = (episode.actions < low - slack) | (episode.actions > high + slack)
     if outside.any():
         step, entry = np.argwhere(outside)[0].tolist()
         raise DemosError(
             f"{source.name}: episode {number}, step {step}: action {mapping.action_names[entry]}: "
-            f"expected {low[entry]:g} to {high[entry]:g}, the bounds of {task.id}, got "
+            f"expected {low[entry]:g} to {high[entry]:g}, {task.bounds_name}, got "
             f"{episode.actions[step, entry]:g}"
         )

@@ -2,12 +2,12 @@
 //! of a cube that it pushes and never lifts.
 //!
 //! A goal is *away* in a coordinate if it is outside the range in which episodes start. A
-//! coordinate is unreached if many desired goals are away in it, and few segments end there. Two
+//! coordinate is unreached if many desired goals are away in it, and few episodes end there. Two
 //! remedies, which are our own:
 //! 1. Windows are drawn from the episodes that went away in it, even if there are only a few.
 //! 2. Steps that end there get the bonus for motion, once motion itself no longer has it.
 //!
-//! Both end when segments end there often enough, for all windows at once.
+//! Both end when episodes end there often enough, for all windows at once.
 
 use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 use rand::RngExt;
@@ -20,8 +20,10 @@ use super::{Replay, Sampler, Window};
 const MARGIN: f32 = 0.4;
 /// Share of the desired goals that must be away.
 const MANY: f64 = 0.1;
-/// Share of the segments below which few end away, relative to that of the desired goals.
+/// Share of the episodes below which few end away, relative to that of the desired goals.
 const FEW: f64 = 0.3;
+/// Number of newest segments among which those that went away are searched.
+const SEARCHED_SEGMENTS: usize = 50_000;
 /// Draws after which a window is taken from another episode.
 const DRAWS_MAX: usize = 20;
 
@@ -68,6 +70,11 @@ impl Unreached {
             low: range[0] - margin,
             high: range[1] + margin,
         });
+        let is_end = |&&slot: &&u32| {
+            let segment = &replay.slots[slot as usize];
+            segment.terminated || segment.truncated
+        };
+        let ends: Vec<u32> = recent.iter().filter(is_end).copied().collect();
         let coordinates = coordinates.filter(|&coordinate| {
             let desired =
                 |&&slot: &&u32| coordinate.is_away(rule.desired(replay.observation_row(slot, 0)));
@@ -75,15 +82,19 @@ impl Unreached {
                 let goal = rule.achieved(replay.last_row(slot));
                 coordinate.is_away(goal) && region.contains(goal)
             };
-            let asked = recent.iter().filter(desired).count() as f64;
-            let reached = recent.iter().filter(achieved).count() as f64;
-            asked > MANY * recent.len() as f64 && reached < FEW * asked
+            let asked = ends.iter().filter(desired).count() as f64;
+            let reached = ends.iter().filter(achieved).count() as f64;
+            // Coordinates that the reward ignores are not part of the task.
+            rule.components.contains(&coordinate.index)
+                && asked > MANY * ends.len() as f64
+                && reached < FEW * asked
         });
         let mut unreached = Self { coordinates: coordinates.collect(), slots: Vec::new() };
         if unreached.any() {
             let is_away =
                 |&slot: &u32| unreached.contains(region, rule.achieved(replay.last_row(slot)));
-            unreached.slots = kept.slots(replay).filter(is_away).collect();
+            let searched = kept.slots(replay).take(SEARCHED_SEGMENTS);
+            unreached.slots = searched.filter(is_away).collect();
         }
         unreached
     }
@@ -115,6 +126,8 @@ impl Unreached {
 
 #[cfg(test)]
 mod tests {
+    use std::ops::Range;
+
     use dmprl_shared::config::Windows;
     use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TRUNCATED};
 
@@ -131,13 +144,12 @@ mod tests {
         GoalRule { reward, ..goal_rule() }
     }
 
-    /// Inserts episodes of two segments that start at 0, rise to `peak`, and end at 0.
-    fn replay(episodes: impl IntoIterator<Item = (f32, f32)>) -> Replay {
-        let mut replay = Replay::new(LAYOUT, 1_000, 1, 1);
-        for (episode, (peak, desired)) in episodes.into_iter().enumerate() {
-            for (step, [before, after]) in [[0.0, peak], [peak, 0.0]].into_iter().enumerate() {
+    /// Inserts episodes of two segments that start at 0, go to `middle`, and end at `end`.
+    fn insert(replay: &mut Replay, episodes: impl IntoIterator<Item = Episode>) {
+        for Episode { number, middle, end, desired } in episodes {
+            for (step, [before, after]) in [[0.0, middle], [middle, end]].into_iter().enumerate() {
                 let header = SegmentHeader {
-                    episode: episode as u32,
+                    episode: number,
                     episode_step: step as u32,
                     steps_len: 1,
                     flags: if step == 1 { TRUNCATED } else { 0 },
@@ -146,7 +158,31 @@ mod tests {
                 replay.insert(&header, &[before, desired, after, desired, 0.1, -1.0]);
             }
         }
+    }
+
+    struct Episode {
+        number: u32,
+        middle: f32,
+        end: f32,
+        desired: f32,
+    }
+
+    /// Makes 100 episodes.
+    fn replay(episode: impl Fn(u32) -> [f32; 3]) -> Replay {
+        let mut replay = Replay::new(LAYOUT, 1_000, 1, 1);
+        insert(&mut replay, numbered(0..100, episode));
         replay
+    }
+
+    /// Makes episodes from (middle, end, desired) of each number.
+    fn numbered(
+        numbers: Range<u32>,
+        episode: impl Fn(u32) -> [f32; 3],
+    ) -> impl Iterator<Item = Episode> {
+        numbers.map(move |number| {
+            let [middle, end, desired] = episode(number);
+            Episode { number, middle, end, desired }
+        })
     }
 
     fn unreached(replay: &Replay) -> Unreached {
@@ -156,29 +192,38 @@ mod tests {
     }
 
     #[test]
-    fn a_coordinate_is_unreached_while_the_task_asks_for_it_and_few_segments_end_there() {
-        // Of 100 episodes 20 shall go to 5. A peak of 0.4 is within the margin.
-        let episodes = |peaks: usize, peak: f32| {
-            let desired = |episode| if episode < 20 { 5.0 } else { 0.0 };
-            replay(
-                (0..100)
-                    .map(|n| (if n % 5 == 0 && n < 5 * peaks { peak } else { 0.0 }, desired(n))),
-            )
+    fn a_coordinate_is_unreached_while_the_task_asks_for_it_and_few_episodes_end_there() {
+        // Of 100 episodes 20 shall go to 5, so fewer than 6 that end there are few.
+        let is_unreached = |count, end| {
+            let desired = |number| if number < 20 { 5.0 } else { 0.0 };
+            unreached(&replay(|number| {
+                [0.0, if number < count { end } else { 0.0 }, desired(number)]
+            }))
+            .any()
         };
-        let is_unreached = |peaks, peak| unreached(&episodes(peaks, peak)).any();
-        // 20 % of the segments are asked to be away, so fewer than 12 of 200 are few.
-        assert!(is_unreached(0, 5.0) && is_unreached(11, 5.0));
-        assert!(!is_unreached(12, 5.0));
-        assert!(is_unreached(12, 0.4), "not away");
-        assert!(is_unreached(12, 50.0), "not in the region");
-        let seldom = replay((0..100).map(|n| (0.0, if n < 10 { 5.0 } else { 0.0 })));
+        assert!(is_unreached(0, 5.0) && is_unreached(5, 5.0));
+        assert!(!is_unreached(6, 5.0));
+        assert!(is_unreached(6, 0.4), "within the margin");
+        assert!(is_unreached(6, 50.0), "not in the region");
+        let comes_back = replay(|_| [5.0, 0.0, 5.0]);
+        assert!(unreached(&comes_back).any(), "episodes do not end there");
+        let seldom = replay(|number| [0.0, 0.0, if number < 10 { 5.0 } else { 0.0 }]);
         assert!(!unreached(&seldom).any(), "hardly asked for");
         assert!(!Unreached::default().any());
     }
 
     #[test]
+    fn coordinates_that_the_reward_ignores_are_not_unreached() {
+        let replay = replay(|_| [0.0, 0.0, 5.0]);
+        let (recent, kept) = Recent::default().read(&replay).unwrap();
+        let ignoring = GoalRule { components: Vec::new(), ..rule() };
+        let region = Region::default();
+        assert!(!Unreached::new(&ignoring, &region, &replay, &recent, kept).any());
+    }
+
+    #[test]
     fn windows_are_drawn_from_all_segments_of_the_episodes_that_went_away() {
-        let replay = replay((0..100).map(|n| (if n == 7 { 4.0 } else { 0.0 }, 5.0)));
+        let replay = replay(|number| [if number == 7 { 4.0 } else { 0.0 }, 0.0, 5.0]);
         let random = dmprl_shared::seeds::stream(1, "test", 0);
         let mut sampler = Sampler::new(Windows::Sliding, random);
         let unreached = unreached(&replay);
@@ -193,8 +238,22 @@ mod tests {
     }
 
     #[test]
+    fn a_reading_that_is_made_later_is_the_same() {
+        // In the smaller ring the later episodes replace some of the first ones.
+        for capacity in [1_000, 250] {
+            let mut replay = Replay::new(LAYOUT, capacity, 1, 1);
+            let episode = |number| [if number % 9 == 0 { 4.0 } else { 0.0 }, 0.0, 5.0];
+            insert(&mut replay, numbered(0..100, episode));
+            let first = unreached(&replay);
+            insert(&mut replay, numbered(100..149, episode));
+            assert!(first.slots.len() > 3);
+            assert_eq!(unreached(&replay), first);
+        }
+    }
+
+    #[test]
     fn only_goals_in_the_region_that_are_away_are_contained() {
-        let replay = replay((0..100).map(|_| (0.0, 5.0)));
+        let replay = replay(|_| [0.0, 0.0, 5.0]);
         let region = Region::new(&rule(), &replay, &[0, 1]);
         let contains = |goal| unreached(&replay).contains(&region, &[goal]);
         assert_eq!([0.3, 0.5, 5.9, 6.1].map(contains), [false, true, true, false]);

@@ -233,7 +233,7 @@ pub struct PolicyConfig {
     pub weight_range: f64,
     /// Controller that converts the DMP's motion into actions.
     pub controller: Controller,
-    /// Action per unit of motion in y, for `controller = "position"`.
+    /// Scaled action u per unit of motion in y, for `controller = "position"`.
     pub position_scale: f64,
     /// Whether rho is bounded.
     pub rho: RhoKind,

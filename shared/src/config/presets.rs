@@ -221,6 +221,7 @@ pub fn algorithm_defaults(name: AlgorithmName) -> Option<Table> {
 // waits for its segments anyway.
 const NDP: &str = r#"
 [policy]
+action_range = 1.0
 controller = "position"
 hidden = [256, 256]
 normalise_observations = false

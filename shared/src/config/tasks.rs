@@ -378,8 +378,9 @@ start_sources = [
     PANDA_OBJECTS,
 ];
 
-// u = 1 moves the end effector by 0.05 m, as in PANDA_REACH_VALUES. At that speed the arm strikes a
-// cube more than it pushes it.
+// An action of 1 moves the end effector by 0.05 m, as in PANDA_REACH_VALUES. At that speed the arm
+// strikes a cube more than it pushes it. `--algo ndp`, for which `position_scale` is, uses all of
+// the range.
 const PANDA_OBJECTS: &str = r#"
 [run]
 steps = 200000

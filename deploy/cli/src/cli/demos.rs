@@ -140,6 +140,10 @@ pub(super) fn run(args: &DemosArgs) -> anyhow::Result<Outcome> {
     if args.json {
         words.push("--json".into());
     }
+    if matches!(args.action, Action::Convert(_)) {
+        // The file is also for policies that use all of the range.
+        words.push("--action-range=1".into());
+    }
     let request = match &args.action {
         Action::Show(_) => vec!["show".into(), source.into()],
         Action::Convert(convert) => {
@@ -179,6 +183,7 @@ fn task_words(args: &ChosenArgs, task: &str) -> anyhow::Result<Vec<OsString>> {
 fn words_of(config: &ExperimentConfig) -> Vec<OsString> {
     let task = &config.task;
     let mut words = vec!["--task".into(), task.id.clone().into()];
+    words.push(format!("--action-range={}", config.policy.action_range).into());
     words.extend(["--options".into(), task.options_toml().into()]);
     for folder in &task.python_path {
         words.extend(["--python-path".into(), folder.into()]);
