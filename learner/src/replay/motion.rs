@@ -104,10 +104,11 @@ impl Motion {
         if !sampler.flip(self.share) {
             return Some(window);
         }
-        if self.unreached.any() && sampler.flip(UNREACHED_SHARE) {
-            if let Some(reaching) = self.unreached.draw(replay, sampler) {
-                return Some(reaching);
-            }
+        if self.unreached.any()
+            && sampler.flip(UNREACHED_SHARE)
+            && let Some(reaching) = self.unreached.draw(replay, sampler)
+        {
+            return Some(reaching);
         }
         for _ in 1..DRAWS_MAX {
             if self.moved(rule, replay, window.slot).is_some_and(|end| region.contains(end)) {
