@@ -166,8 +166,8 @@ impl Archive<'_> {
             if !(low - slack..=high + slack).contains(&action) {
                 let place = format!("actions, row {row} entry {dimension}");
                 let mut bounds = format!("the environment's own units, {low} to {high}");
-                if high < spec.action_high[dimension] {
-                    bounds.push_str(", a part of its bounds (policy.action_range = 1 is all)");
+                if high < spec.action_high[dimension] - slack {
+                    bounds.push_str(" (all of its range: --set policy.action_range=1)");
                 }
                 return Err(self.invalid(place, bounds, action.to_string()));
             }

@@ -82,10 +82,10 @@ impl GoalSampler {
     /// Finds the task's region and counts motion in the recent episodes, if that is due. Call it
     /// before a batch is sampled.
     pub fn read_recent(&mut self, replay: &Replay) {
-        let Some((recent, kept)) = self.recent.read(replay) else { return };
-        self.region = Region::new(&self.rule, replay, &recent);
+        let Some(newest) = self.recent.read(replay) else { return };
+        self.region = Region::new(&self.rule, replay, &newest.slots);
         if let Some(motion) = &mut self.motion {
-            motion.read(&self.rule, &self.region, replay, &recent, kept);
+            motion.read(&self.rule, &self.region, replay, &newest);
         }
     }
 

@@ -6,15 +6,15 @@
 //! 2. A step that moves it gets a bonus while fewer than half of the recent episodes moved it. The
 //!    bonus is added when a batch is sampled, so it starts and ends for all windows at once.
 //!
-//! Half of that share and, when it has ended, the bonus then help to reach coordinates that the
-//! task asks for ([`super::unreached`]).
+//! If the policy does not reach a coordinate that the task asks for ([`super::unreached`]), half of
+//! that share and, once many episodes move the goal, the bonus are for this coordinate.
 //!
 //! Windows and bonus are for motion within the region of the task ([`super::region`]), because a
 //! policy that strikes an object as far as it can has not learned to place it.
 
 use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 
-use super::recent::Kept;
+use super::recent::Newest;
 use super::region::Region;
 use super::unreached::Unreached;
 use super::{Replay, Sampler, Window};
@@ -27,7 +27,7 @@ const STEP_MOVES: f64 = 0.04;
 /// Share of the recent episodes below which steps get a bonus, and from which on workers explore
 /// less.
 const RARE: f64 = 0.5;
-/// Share of the windows from moving episodes that come from those with unreached coordinates.
+/// Share of these windows that come from episodes that went away in an unreached coordinate.
 const UNREACHED_SHARE: f64 = 0.5;
 /// Draws after which a window is taken from any episode.
 const DRAWS_MAX: usize = 30;
@@ -55,35 +55,24 @@ impl Motion {
         Some(Self { threshold, share, unreached, bonus, moving: None })
     }
 
-    /// Counts the episodes that end in one of the `recent` slots, and finds unreached coordinates.
+    /// Counts the newest episodes, and finds unreached coordinates.
     pub(super) fn read(
         &mut self,
         rule: &GoalRule,
         region: &Region,
         replay: &Replay,
-        recent: &[u32],
-        kept: Kept,
+        newest: &Newest,
     ) {
-        let (mut ended, mut moved) = (0_u32, 0_u32);
-        for &slot in recent {
-            let segment = &replay.slots[slot as usize];
-            if segment.terminated || segment.truncated {
-                ended += 1;
-                moved += u32::from(self.moved(rule, replay, slot).is_some());
-            }
-        }
-        self.moving = (ended > 0).then(|| f64::from(moved) / f64::from(ended));
-        self.unreached = Unreached::new(rule, region, replay, recent, kept);
+        let moved = |&&slot: &&u32| self.moved(rule, replay, slot).is_some();
+        let count = newest.ends.iter().filter(moved).count();
+        self.moving = (!newest.ends.is_empty()).then(|| count as f64 / newest.ends.len() as f64);
+        self.unreached = Unreached::new(rule, region, replay, newest);
     }
 
     /// Returns the bonus of a step that [`Self::has_bonus`], or 0 if no step has it.
     pub(super) fn bonus(&self) -> f32 {
-        let settled_short = self.is_settled() && self.unreached.any();
-        if self.moving.is_some_and(|share| share < RARE) || settled_short {
-            self.bonus
-        } else {
-            0.0
-        }
+        let is_due = if self.is_settled() { self.unreached.any() } else { self.moving.is_some() };
+        if is_due { self.bonus } else { 0.0 }
     }
 
     /// Returns whether many recent episodes moved the achieved goal.
@@ -92,7 +81,8 @@ impl Motion {
     }
 
     /// Draws a window, with probability `share` from an episode that moved the achieved goal and
-    /// ended in the region. Half of these are from episodes that reached unreached coordinates.
+    /// ended in the region. While a coordinate is unreached, half of these windows are from
+    /// episodes that went away in it.
     pub(super) fn draw(
         &self,
         rule: &GoalRule,
@@ -129,8 +119,8 @@ impl Motion {
     }
 
     /// Returns whether step `step` of a window, counted from 1, gets the bonus: it moves the
-    /// achieved goal and leaves it in the region or, once episodes do, leaves it in an unreached
-    /// coordinate.
+    /// achieved goal and leaves it in the region. Once many episodes move it, the step must leave it
+    /// away in an unreached coordinate instead.
     pub(super) fn has_bonus(
         &self,
         rule: &GoalRule,
@@ -168,8 +158,12 @@ mod tests {
 
     /// Inserts an episode of two segments that achieves 0, 0, `step`, `step`, `step`.
     fn episode(replay: &mut Replay, number: u32, step: f32) {
-        let first = [0.0, 0.3, 0.0, 0.3, step, 0.3, 0.1, 0.2, -2.0, -2.0];
-        let second = [step, 0.3, step, 0.3, step, 0.3, 0.1, 0.2, -2.0, -2.0];
+        episode_with_goal(replay, number, step, 0.3);
+    }
+
+    fn episode_with_goal(replay: &mut Replay, number: u32, step: f32, goal: f32) {
+        let first = [0.0, goal, 0.0, goal, step, goal, 0.1, 0.2, -2.0, -2.0];
+        let second = [step, goal, step, goal, step, goal, 0.1, 0.2, -2.0, -2.0];
         for (block, episode_step, flags) in [(first, 0, 0), (second, 2, TRUNCATED)] {
             let header = SegmentHeader {
                 episode: number,
@@ -188,8 +182,8 @@ mod tests {
 
     /// Counts the recent episodes, if that is due.
     fn count(motion: &mut Motion, recent: &mut Recent, replay: &Replay) {
-        if let Some((slots, kept)) = recent.read(replay) {
-            motion.read(&rule(), &Region::default(), replay, &slots, kept);
+        if let Some(newest) = recent.read(replay) {
+            motion.read(&rule(), &Region::default(), replay, &newest);
         }
     }
 
@@ -281,6 +275,41 @@ mod tests {
     fn region(replay: &Replay) -> Region {
         let slots: Vec<u32> = (0..replay.len() as u32).collect();
         Region::new(&rule(), replay, &slots)
+    }
+
+    #[test]
+    fn once_episodes_move_the_goal_an_unreached_coordinate_has_the_bonus_and_half_of_the_share() {
+        // All episodes shall go to 3 and end away, at 2 or, most of them, on the other side of the
+        // region. A fifth is too few.
+        let mut replay = Replay::new(LAYOUT, 2_000, 1, 1);
+        let reaches = |number| number % 5 == 0;
+        for number in 0..100 {
+            episode_with_goal(&mut replay, number, if reaches(number) { 2.0 } else { -20.0 }, 3.0);
+        }
+        let mut motion = motion(1.0);
+        let newest = Recent::default().read(&replay).unwrap();
+        let region = Region::new(&rule(), &replay, &newest.slots);
+        motion.read(&rule(), &region, &replay, &newest);
+        assert_eq!((motion.is_settled(), motion.bonus()), (true, 2.0));
+        let has_bonus = |slot, offset, step| {
+            let window = replay.window(slot, offset).unwrap();
+            motion.has_bonus(&rule(), &region, &replay, &window, step)
+        };
+        // Also a step that does not move it; not one before it is away, or outside of the region.
+        let away = [has_bonus(0, 0, 2), has_bonus(1, 0, 1)];
+        assert_eq!((away, has_bonus(0, 0, 1), has_bonus(2, 0, 2)), ([true; 2], false, false));
+        // Half of the windows, and of the other half those that 30 draws find.
+        let random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut sampler = Sampler::new(Windows::Segment, random);
+        let mut draw = || motion.draw(&rule(), &region, &replay, &mut sampler).unwrap();
+        assert!((0..500).filter(|_| reaches(draw().slot / 2)).count() > 480);
+        // When all of them reach it, nothing is left of it.
+        for number in 100..200 {
+            episode_with_goal(&mut replay, number, 2.0, 3.0);
+        }
+        let newest = Recent::default().read(&replay).unwrap();
+        motion.read(&rule(), &region, &replay, &newest);
+        assert_eq!((motion.is_settled(), motion.bonus()), (true, 0.0));
     }
 
     #[test]

@@ -15,37 +15,47 @@ pub(super) struct Recent {
 }
 
 impl Recent {
-    /// Returns the slots of the newest segments, newest first, and of all that may be read, if a
-    /// reading is due. A replay still has these when the next reading is due, so a resumed run
-    /// reads the same ones.
-    pub(super) fn read(&mut self, replay: &Replay) -> Option<(Vec<u32>, Kept)> {
+    /// Returns the newest segments, if a reading is due. They are segments that a replay still has
+    /// when the next reading is due, so a resumed run reads the same ones.
+    pub(super) fn read(&mut self, replay: &Replay) -> Option<Newest> {
         let inserted = replay.inserted - replay.inserted % READ_EVERY;
         if inserted < self.due {
             return None;
         }
         self.due = inserted + READ_EVERY;
-        let newest = replay.inserted - inserted;
+        let later = replay.inserted - inserted;
         let ring = (replay.slots.len() - replay.demonstrations) as u64;
         // Of each environment's episode the start may have been replaced. Its oldest segment is
         // left out, because a replay that is read from a file takes it for the start.
-        let kept = ring.saturating_sub(READ_EVERY + replay.tails.len() as u64);
-        let kept = Kept { newest, len: kept.min(inserted) };
-        let recent = kept.slots(replay).take(RECENT_SEGMENTS).collect();
-        Some((recent, kept))
+        let kept = ring.saturating_sub(READ_EVERY + replay.tails.len() as u64).min(inserted);
+        let mut newest = Newest { slots: Vec::new(), ends: Vec::new(), later, kept };
+        newest.slots = newest.all(replay).take(RECENT_SEGMENTS).collect();
+        let ends = newest.slots.iter().filter(|&&slot| {
+            let segment = &replay.slots[slot as usize];
+            segment.terminated || segment.truncated
+        });
+        newest.ends = ends.copied().collect();
+        Some(newest)
     }
 }
 
-/// Segments of the ring that may be read, as numbers of later segments.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Kept {
-    newest: u64,
-    len: u64,
+/// The segments of one reading.
+#[derive(Debug)]
+pub(super) struct Newest {
+    /// Slots of the newest segments, newest first.
+    pub(super) slots: Vec<u32>,
+    /// Those of them that end an episode.
+    pub(super) ends: Vec<u32>,
+    /// Segments that were inserted after the first of them, and are not read.
+    later: u64,
+    /// Number of all segments that may be read.
+    kept: u64,
 }
 
-impl Kept {
-    /// Returns their slots, newest first.
-    pub(super) fn slots(self, replay: &Replay) -> impl Iterator<Item = u32> {
-        (self.newest..self.newest + self.len).map_while(|back| replay.slot_before(back))
+impl Newest {
+    /// Returns the slots of all segments that may be read, newest first.
+    pub(super) fn all(&self, replay: &Replay) -> impl Iterator<Item = u32> {
+        (self.later..self.later + self.kept).map_while(|back| replay.slot_before(back))
     }
 }
 

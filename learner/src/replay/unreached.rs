@@ -12,7 +12,7 @@
 use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 use rand::RngExt;
 
-use super::recent::Kept;
+use super::recent::Newest;
 use super::region::{self, Region};
 use super::{Replay, Sampler, Window};
 
@@ -51,17 +51,11 @@ pub(super) struct Unreached {
 }
 
 impl Unreached {
-    /// Finds the coordinates from the `recent` slots, and the segments among the `kept` ones.
-    pub(super) fn new(
-        rule: &GoalRule,
-        region: &Region,
-        replay: &Replay,
-        recent: &[u32],
-        kept: Kept,
-    ) -> Self {
+    /// Finds the coordinates from the newest episodes, and the segments that went away.
+    pub(super) fn new(rule: &GoalRule, region: &Region, replay: &Replay, newest: &Newest) -> Self {
         let GoalReward::Sparse { threshold, .. } = rule.reward else { return Self::default() };
         let mut starts = Vec::new();
-        for &slot in recent.iter().filter(|&&slot| replay.rank(slot) == 0) {
+        for &slot in newest.slots.iter().filter(|&&slot| replay.rank(slot) == 0) {
             region::widen(&mut starts, rule.achieved(replay.observation_row(slot, 0)));
         }
         let margin = MARGIN * threshold as f32;
@@ -70,11 +64,7 @@ impl Unreached {
             low: range[0] - margin,
             high: range[1] + margin,
         });
-        let is_end = |&&slot: &&u32| {
-            let segment = &replay.slots[slot as usize];
-            segment.terminated || segment.truncated
-        };
-        let ends: Vec<u32> = recent.iter().filter(is_end).copied().collect();
+        let ends = &newest.ends;
         let coordinates = coordinates.filter(|&coordinate| {
             let desired =
                 |&&slot: &&u32| coordinate.is_away(rule.desired(replay.observation_row(slot, 0)));
@@ -93,7 +83,7 @@ impl Unreached {
         if unreached.any() {
             let is_away =
                 |&slot: &u32| unreached.contains(region, rule.achieved(replay.last_row(slot)));
-            let searched = kept.slots(replay).take(SEARCHED_SEGMENTS);
+            let searched = newest.all(replay).take(SEARCHED_SEGMENTS);
             unreached.slots = searched.filter(is_away).collect();
         }
         unreached
@@ -186,9 +176,9 @@ mod tests {
     }
 
     fn unreached(replay: &Replay) -> Unreached {
-        let (recent, kept) = Recent::default().read(replay).unwrap();
-        let region = Region::new(&rule(), replay, &recent);
-        Unreached::new(&rule(), &region, replay, &recent, kept)
+        let newest = Recent::default().read(replay).unwrap();
+        let region = Region::new(&rule(), replay, &newest.slots);
+        Unreached::new(&rule(), &region, replay, &newest)
     }
 
     #[test]
@@ -215,10 +205,10 @@ mod tests {
     #[test]
     fn coordinates_that_the_reward_ignores_are_not_unreached() {
         let replay = replay(|_| [0.0, 0.0, 5.0]);
-        let (recent, kept) = Recent::default().read(&replay).unwrap();
+        let newest = Recent::default().read(&replay).unwrap();
         let ignoring = GoalRule { components: Vec::new(), ..rule() };
         let region = Region::default();
-        assert!(!Unreached::new(&ignoring, &region, &replay, &recent, kept).any());
+        assert!(!Unreached::new(&ignoring, &region, &replay, &newest).any());
     }
 
     #[test]
