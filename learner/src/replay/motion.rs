@@ -119,8 +119,8 @@ impl Motion {
     }
 
     /// Returns whether step `step` of a window, counted from 1, gets the bonus: it moves the
-    /// achieved goal and leaves it in the region. Once many episodes move it, the step must leave it
-    /// away in an unreached coordinate instead.
+    /// achieved goal and leaves it in the region. Once many episodes move it, the step must leave
+    /// it away in an unreached coordinate instead.
     pub(super) fn has_bonus(
         &self,
         rule: &GoalRule,
