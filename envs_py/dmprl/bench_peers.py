@@ -43,7 +43,7 @@ class RandomActor:
         self._shape = (plan["env_count"], plan["decision_steps"], plan["spec"]["action_len"])
 
     def actions(self, observations: NDArray) -> NDArray[np.float64]:
-        """Returns actions like those of the policy, (E, K, A)."""
+        """Returns actions of the shape of the policy's, (E, K, A)."""
         return self._random.uniform(self._low, self._high, self._shape)
 
     def carry_on(self, ended: NDArray[np.bool_]) -> None:

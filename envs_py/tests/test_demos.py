@@ -201,6 +201,13 @@ class DemosTest(unittest.TestCase):
         bounds = "step 1: action action[0]", "expected -2 to 2", "got -2.5"
         self.refused(*bounds, source=wide, task=REACH)
 
+    def test_actions_beyond_the_share_that_a_policy_uses_are_refused(self):
+        source = FakeSource(episode(actions=np.array([[0], [1.0], [1.5], [0]])))
+        whole, half = Task(REACH), Task(REACH, action_range=0.5)
+        list(Conversion(source, whole, Wishes()).checked())
+        with self.assertRaisesRegex(DemosError, "step 2: .* expected -1 to 1, .*action_range"):
+            list(Conversion(source, half, Wishes()).checked())
+
     def test_rates_that_make_no_sense_are_refused(self):
         source = FakeSource(episode(), rate_hz=20.0)
         for rate in (0.0, -1.0, float("nan"), float("inf"), 20_000.0):

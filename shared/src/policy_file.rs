@@ -311,7 +311,7 @@ impl<'a> Contents<'a> {
         if got == expected {
             return Ok(());
         }
-        let expected = format!("{expected}, as configured (--set policy.action_range={got})");
+        let expected = format!("{expected}, as in this run (or --set policy.action_range={got})");
         Err(self.mismatch("policy.action_range", expected, got.to_string()))
     }
 

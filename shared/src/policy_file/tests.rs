@@ -72,7 +72,7 @@ fn policy_survives_a_round_trip_and_other_or_corrupted_files_are_rejected() {
     assert!(error.contains("actor.1.weight") && error.contains("[128, 256]"), "{error}");
     let slower = policy(&[("policy.action_range", "0.5")]);
     let error = load(&path, &slower, Match::Sizes).unwrap_err().to_string();
-    assert!(error.contains("0.5, as configured (--set policy.action_range=1)"), "{error}");
+    assert!(error.contains("0.5, as in this run (or --set policy.action_range=1)"), "{error}");
 
     let bytes = fs::read(&path).unwrap();
     fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
