@@ -23,6 +23,8 @@ from dmprl.tasks.panda_objects import OBJECT_ENTRIES, PandaObjects, PandaSlide
 
 STEP_S = 0.04
 """Duration of a step [s]."""
+ACTION_MAX = 0.6
+"""Largest action, because policies of these tasks use this share of the action range."""
 TRAVEL_HEIGHT = 0.09
 """Height of the end effector at which it passes over an object."""
 PUSH_HEIGHT = 0.02
@@ -40,7 +42,7 @@ OPEN_WIDTH, GRIPPED_WIDTH = 0.06, (0.036, 0.058)
 CARRY_GAIN, CARRY_MAX = 0.3, 0.025
 """Share of the way to the goal in one step, and its maximum along each axis. A faster start would
 pull the fingers off the cube."""
-OPEN, CLOSE = 1.0, -1.0
+OPEN, CLOSE = ACTION_MAX, -ACTION_MAX
 """Actions of the fingers."""
 RELEASE = np.array([0.0, 0.0, 0.0, OPEN])
 CLEAR_HEIGHT = 0.1
@@ -220,7 +222,7 @@ CONTROLLERS: dict[str, type[Controller]] = {
 
 def towards(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the action (3,) that moves the end effector by this, or as far as one action can."""
-    return np.clip(displacement / DISPLACEMENT, -1.0, 1.0)
+    return np.clip(displacement / DISPLACEMENT, -ACTION_MAX, ACTION_MAX)
 
 
 def push(state: State, index: int, goal: NDArray[np.float64]) -> NDArray[np.float64]:
