@@ -22,7 +22,8 @@ const MARGIN: f32 = 0.4;
 const MANY: f64 = 0.1;
 /// Share of the episodes below which few end away, relative to that of the desired goals.
 const FEW: f64 = 0.3;
-/// Number of newest segments among which those that went away are searched.
+/// Number of newest segments among which those that went away are searched, beside all
+/// demonstrations.
 const SEARCHED_SEGMENTS: usize = 50_000;
 /// Draws after which a window is taken from another episode.
 const DRAWS_MAX: usize = 20;
@@ -46,7 +47,7 @@ impl Coordinate {
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Unreached {
     coordinates: Vec<Coordinate>,
-    /// Slots of segments that end away, within the region, newest first.
+    /// Slots of segments that end away, within the region, newest first; then demonstrations.
     slots: Vec<u32>,
 }
 
@@ -83,7 +84,8 @@ impl Unreached {
         if unreached.any() {
             let is_away =
                 |&slot: &u32| unreached.contains(region, rule.achieved(replay.last_row(slot)));
-            let searched = newest.all(replay).take(SEARCHED_SEGMENTS);
+            let demonstrated = 0..replay.demonstrations as u32;
+            let searched = newest.all(replay).take(SEARCHED_SEGMENTS).chain(demonstrated);
             unreached.slots = searched.filter(is_away).collect();
         }
         unreached
@@ -225,6 +227,26 @@ mod tests {
         }
         assert!(drawn[0] > 60 && drawn[1] > 60, "{drawn:?}");
         assert_eq!(Unreached::default().draw(&replay, &mut sampler), None);
+    }
+
+    #[test]
+    fn demonstrations_that_went_away_are_drawn_and_do_not_count_as_reached() {
+        let mut replay = Replay::new(LAYOUT, 1_000, 1, 1);
+        for (step, after) in [0.0, 4.0].into_iter().enumerate() {
+            let header = SegmentHeader {
+                episode_step: step as u32,
+                steps_len: 1,
+                flags: if step == 1 { TRUNCATED } else { 0 },
+                ..SegmentHeader::default()
+            };
+            replay.insert_demonstration(&header, &[0.0, 5.0, after, 5.0, 0.1, -1.0]);
+        }
+        assert!(Recent::default().read(&replay).unwrap().slots.is_empty());
+        insert(
+            &mut replay,
+            numbered(0..50, |number| [if number == 7 { 4.0 } else { 0.0 }, 0.0, 5.0]),
+        );
+        assert_eq!(unreached(&replay).slots, [16, 1]);
     }
 
     #[test]
