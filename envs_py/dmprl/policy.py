@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dmprl import zoo
 from dmprl.hold import Hold, NoHoldError
 from dmprl.numpy_policy import NumpyPolicy
 from dmprl.policy_description import check
@@ -63,12 +64,13 @@ class Policy:
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
-        """Loads a policy file written by ``dmprl export``, or the best policy of a run directory.
+        """Loads a policy file of ``dmprl export``, the best policy of a run directory, or one that
+        comes with the package (``zoo:panda-reach``).
 
         :raises OSError: if it cannot be read.
         :raises dmprl.PolicyFileError: if it is not a policy file, is damaged, or is too old.
         """
-        path = Path(path)
+        path = zoo.path(path) or Path(path)
         if path.is_dir():
             run, path = path, path / "checkpoints" / "best"
             if not path.exists():

@@ -32,7 +32,7 @@ use crate::manifest::Manifest;
 /// plot names.
 const NAME_LEN_MAX: usize = 128;
 /// Folders that every run directory has.
-const FOLDERS: [&str; 5] = ["checkpoints", "policies", "logs", "videos", "plots"];
+pub(crate) const FOLDERS: [&str; 5] = ["checkpoints", "policies", "logs", "videos", "plots"];
 /// Maximum size of a configuration, manifest or other small file. A larger one was not written by
 /// this program.
 const SMALL_FILE_BYTES_MAX: u64 = 4 << 20;

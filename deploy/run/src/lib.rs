@@ -26,6 +26,7 @@ pub mod tail;
 mod timestamp;
 mod title;
 mod watch;
+mod zoo;
 
 pub use atomic::replace as replace_file;
 pub use directory::{RunDirectory, TOKEN_FILE, safe_name};
@@ -43,3 +44,4 @@ pub use setup::Setup;
 pub use timestamp::{compact, compact_now, now_rfc3339, rfc3339, unix_s};
 pub use title::{method_label, title};
 pub use watch::{Interrupted, Watch, is_ignored};
+pub use zoo::Zoo;

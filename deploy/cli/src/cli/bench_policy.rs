@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clap::Args;
 use dmprl_analysis::export::read_policy;
 use dmprl_bench::{self as bench, PolicyBench};
+use dmprl_run::PolicyChoice;
 use dmprl_run::failure::{Outcome, wrong_use};
-use dmprl_run::{PolicyChoice, RunDirectory};
 use dmprl_shared::config::{Limits, TASKS, task_defaults};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::Policy;
@@ -16,7 +16,7 @@ use dmprl_shared::seeds;
 use super::bench_values::interpreter;
 use super::configuration::{merge, refuse};
 use super::configured::ConfiguredArgs;
-use super::{cores, emit, prepare_python, python_home};
+use super::{cores, emit, open_run, prepare_python, python_home};
 
 const HELP: &str = "\
 One observation at a time, on one core, as on a robot. In every round each of these makes --calls
@@ -37,7 +37,7 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct PolicyArgs {
-    /// A run directory, for its best policy, or a file of `dmprl export`.
+    /// A run directory or zoo:TASK, for its best policy, or a file of `dmprl export`.
     #[arg(required_unless_present = "task", conflicts_with = "task")]
     run: Option<PathBuf>,
     /// Use an untrained policy for this task of `dmprl tasks`.
@@ -91,7 +91,7 @@ fn opened(args: &PolicyArgs) -> anyhow::Result<OpenedPolicy> {
         if path.is_file() {
             return Ok(policy_file::open(path)?);
         }
-        let run = RunDirectory::open(path)?;
+        let run = open_run(path)?;
         return read_policy(&run, &run.choose_policy(PolicyChoice::Best)?);
     }
     let name = args.task.as_deref().unwrap_or_default();

@@ -271,8 +271,8 @@ impl ForeignSources {
         Ok(())
     }
 
-    /// Moves the converted files into the run directory.
-    pub(super) fn move_to(self, run: &Path) -> anyhow::Result<()> {
+    /// Copies the converted files into the run directory.
+    pub(super) fn copy_to(self, run: &Path) -> anyhow::Result<()> {
         let Some(folder) = self.folder else { return Ok(()) };
         for Foreign { file, .. } in &self.sources {
             // Not renamed, because the folder may be on another file system.

@@ -14,7 +14,7 @@ use toml::Table;
 
 use super::configuration::refuse;
 use super::trust::TrustArgs;
-use super::{emit, prepare_python, this_program};
+use super::{emit, open_run, prepare_python, this_program};
 
 /// Mean returns that differ by at most this much count as equal.
 const SAME_RETURN: f64 = 1e-6;
@@ -30,6 +30,7 @@ a log into the run directory.
 
 EXAMPLES
   dmprl eval runs/mine
+  dmprl eval zoo:panda-pick-and-place
   dmprl eval runs/mine --policy latest --episodes 100
   dmprl eval runs/mine --policy 4120 --json
   dmprl eval runs/mine --set 'task.randomise.mass=[0.5, 2.0]' --episodes 100";
@@ -38,7 +39,7 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct EvalArgs {
-    /// The run directory.
+    /// The run directory, or zoo:TASK for a policy that comes with dmprl.
     run: PathBuf,
     /// best, latest, or a policy version.
     #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
@@ -57,7 +58,7 @@ pub(super) struct EvalArgs {
 }
 
 pub(super) fn run(args: &EvalArgs) -> anyhow::Result<Outcome> {
-    let run = RunDirectory::open(&args.run)?;
+    let run = open_run(&args.run)?;
     let chosen = run.choose_policy(args.policy)?;
     let config = run.config()?;
     args.trust.check_for(&run, &config)?;

@@ -6,10 +6,10 @@ use clap::{Args, ValueEnum};
 use dmprl_analysis::export::{onnx, read_policy, safetensors};
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::{binary_bytes, shown};
-use dmprl_run::{PolicyChoice, RunDirectory, replace_file};
+use dmprl_run::{PolicyChoice, replace_file};
 use dmprl_shared::policy::Hold;
 
-use super::emit;
+use super::{emit, open_run};
 
 const HELP: &str = "\
 The file contains everything needed to act: observation normalisation, network, movement primitive,
@@ -31,7 +31,7 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct ExportArgs {
-    /// The run directory.
+    /// The run directory, or zoo:TASK for a policy that comes with dmprl.
     run: PathBuf,
     /// File format [default: by the extension of --output, else safetensors].
     #[arg(long)]
@@ -95,7 +95,7 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
             format.extension()
         )));
     }
-    let run = RunDirectory::open(&args.run)?;
+    let run = open_run(&args.run)?;
     let chosen = run.choose_policy(args.policy)?;
     let mut opened = read_policy(&run, &chosen)?;
     if let Some(hold) = &args.hold {

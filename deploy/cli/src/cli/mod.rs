@@ -38,9 +38,8 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 use dmprl_bench::{SegmentFeederArgs, TransportWorkerArgs, segment_feeder, transport_worker};
-use dmprl_run::Progress;
-use dmprl_run::Session;
 use dmprl_run::failure::{Outcome, exit_code, render, wrong_use};
+use dmprl_run::{Progress, RunDirectory, Session, Zoo};
 use dmprl_shared::config::ExperimentConfig;
 
 use crate::roles::{
@@ -291,6 +290,17 @@ fn prepare_python_with(_extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
 #[cfg(not(feature = "python"))]
 fn prepare_python() -> anyhow::Result<PathBuf> {
     anyhow::bail!("this build has no Python support; build it with the feature `python`")
+}
+
+/// Opens a run directory, or the copy of a policy `zoo:NAME`.
+fn open_run(path: &Path) -> anyhow::Result<RunDirectory> {
+    match Zoo::name(path) {
+        None => RunDirectory::open(path),
+        Some(name) => {
+            let package = python_home()?.1.join("dmprl");
+            Zoo::of_package(&package).open(name, Path::new("runs"))
+        }
+    }
 }
 
 /// Returns the path of this program, which also plays the roles: all processes are the same build.

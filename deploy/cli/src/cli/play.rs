@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use clap::Args;
 use dmprl_analysis::export::{read_policy, safetensors};
+use dmprl_run::PolicyChoice;
 use dmprl_run::Watch;
 use dmprl_run::failure::Outcome;
-use dmprl_run::{PolicyChoice, RunDirectory};
 use rustix::process::{Pid, Signal, kill_process};
 
-use super::prepare_python_with;
 use super::trust::TrustArgs;
+use super::{open_run, prepare_python_with};
 use crate::terminal::say;
 
 /// Interval between checks for exit and interrupt.
@@ -29,6 +29,7 @@ there is a display; otherwise it serves a page on loopback and prints its addres
 machine: ssh -L 8788:127.0.0.1:8788 HOST, then http://127.0.0.1:8788/.
 
 EXAMPLES
+  dmprl play zoo:panda-pick-and-place
   dmprl play runs/mine
   dmprl play runs/mine --policy latest --seed 1004 --episodes 3
   dmprl play runs/mine --stream --port 8788";
@@ -37,7 +38,7 @@ EXAMPLES
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct PlayArgs {
-    /// The run directory.
+    /// The run directory, or zoo:TASK for a policy that comes with dmprl.
     run: PathBuf,
     /// best, latest, or a policy version.
     #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
@@ -59,7 +60,7 @@ pub(super) struct PlayArgs {
 }
 
 pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
-    let run = RunDirectory::open(&args.run)?;
+    let run = open_run(&args.run)?;
     let config = run.config()?;
     args.trust.check_for(&run, &config)?;
     let opened = read_policy(&run, &run.choose_policy(args.policy)?)?;

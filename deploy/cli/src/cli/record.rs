@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use clap::Args;
 use dmprl_analysis::motion::RecordedEpisode;
+use dmprl_run::PolicyChoice;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::shown;
-use dmprl_run::{PolicyChoice, RunDirectory};
 use dmprl_sweep::record::{Observer, RecordPlan, Recordings, record};
 
 use super::trust::TrustArgs;
-use super::{emit, prepare_python_with, this_program};
+use super::{emit, open_run, prepare_python_with, this_program};
 use crate::terminal::{TerminalProgress, say};
 
 const HELP: &str = "\
@@ -33,7 +33,7 @@ const EPISODES_MAX: u64 = 100;
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
 pub(super) struct RecordArgs {
-    /// The run directory.
+    /// The run directory, or zoo:TASK for a policy that comes with dmprl.
     run: PathBuf,
     /// best, latest, or a policy version.
     #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
@@ -60,8 +60,8 @@ pub(super) struct RecordArgs {
 }
 
 pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
-    let run = RunDirectory::open(&args.run)?;
-    let other = args.compare.as_deref().map(RunDirectory::open).transpose()?;
+    let run = open_run(&args.run)?;
+    let other = args.compare.as_deref().map(open_run).transpose()?;
     let mut sides = vec![(&run, run.choose_policy(args.policy)?)];
     if let Some(other) = &other {
         // A version belongs to one run; the other shows its best policy.

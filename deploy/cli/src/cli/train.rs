@@ -9,7 +9,7 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::grouped;
-use dmprl_run::{Manifest, PolicyChoice, RunDirectory, compact, safe_name};
+use dmprl_run::{Manifest, PolicyChoice, RunDirectory, Zoo, compact, safe_name};
 use dmprl_shared::config::{
     AlgorithmName, ExperimentConfig, Limits, PolicyKind, TaskDefaults, task_defaults,
 };
@@ -24,7 +24,8 @@ use super::demos::ForeignSources;
 use super::output::OutputArgs;
 use super::trust::{Said, TrustArgs, mark_as_own};
 use super::{
-    TrainingPlan, cores, name_limits, prepare_python, this_program, train_session, training_session,
+    TrainingPlan, cores, name_limits, open_run, prepare_python, this_program, train_session,
+    training_session,
 };
 use crate::terminal::say;
 
@@ -77,7 +78,7 @@ pub(super) struct TrainArgs {
     /// Threads of the update.
     #[arg(long, value_name = "N")]
     threads: Option<u32>,
-    /// Initialise the policy from a run's best policy or from a policy file.
+    /// Initialise the policy from a run's best policy, zoo:TASK or a policy file.
     #[arg(long, value_name = "RUN|FILE")]
     init_from: Option<PathBuf>,
     /// Demonstrations to learn from: a file of steps, or a data set of Minari (minari:ID or a
@@ -142,7 +143,7 @@ pub(super) fn run(args: &TrainArgs) -> anyhow::Result<Outcome> {
     let session = training_session(&config, &venv)?;
     let manifest = Manifest::begin(init_from.map(|path| path.display().to_string()), session)?;
     let run = RunDirectory::create(&path, &config, &manifest)?;
-    foreign.move_to(run.path())?;
+    foreign.copy_to(run.path())?;
     mark_as_own(&run, &config);
     name_limits(&run);
     let lock = run.lock(Duration::ZERO)?;
@@ -222,13 +223,13 @@ fn flags(args: &TrainArgs) -> anyhow::Result<[Option<Flag>; 8]> {
 
 /// Returns the path of a run's best policy, or of the given policy file.
 fn policy_file(path: &Path) -> anyhow::Result<PathBuf> {
-    let file = if path.is_dir() {
-        RunDirectory::open(path)?.choose_policy(PolicyChoice::Best)?.path
+    let file = if path.is_dir() || Zoo::name(path).is_some() {
+        open_run(path)?.choose_policy(PolicyChoice::Best)?.path
     } else if path.is_file() {
         path.to_owned()
     } else {
         return Err(wrong_use(format!(
-            "--init-from {}: expected a run directory or a policy file",
+            "--init-from {}: expected a run directory, zoo:TASK or a policy file",
             path.display()
         )));
     };

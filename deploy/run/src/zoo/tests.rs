@@ -1,0 +1,65 @@
+//! Tests of the copies of policies that come with the package.
+
+use dmprl_shared::config::ExperimentConfig;
+
+use super::*;
+use crate::failure::WrongUse;
+use crate::manifest::Manifest;
+
+/// Makes a package with the policy `lift`.
+fn package() -> (tempfile::TempDir, Zoo) {
+    let package = tempfile::tempdir().unwrap();
+    let folder = package.path().join("zoo/lift");
+    let manifest = Manifest::new(None).unwrap();
+    RunDirectory::create(&folder, &ExperimentConfig::default(), &manifest).unwrap();
+    fs::write(folder.join("spec.json"), "{}").unwrap();
+    fs::write(folder.join("policies/7.safetensors"), "parameters").unwrap();
+    fs::write(package.path().join("zoo/__init__.py"), "").unwrap();
+    let zoo = Zoo::of_package(package.path());
+    (package, zoo)
+}
+
+#[test]
+fn only_names_with_the_prefix_are_of_the_zoo() {
+    assert_eq!(Zoo::name(Path::new("zoo:lift")), Some("lift"));
+    assert_eq!(Zoo::name(Path::new("runs/zoo:lift")), None);
+    assert_eq!(Zoo::name(Path::new("lift")), None);
+}
+
+#[test]
+fn a_policy_is_copied_once_into_a_run_directory() {
+    let (_package, zoo) = package();
+    let home = tempfile::tempdir().unwrap();
+    let runs = home.path().join("runs");
+    let run = zoo.open("lift", &runs).unwrap();
+    assert_eq!(run.saved_policies().unwrap().into_iter().collect::<Vec<_>>(), [7]);
+    assert!(run.path().ends_with("runs/zoo-lift"));
+    assert!(FOLDERS.iter().all(|folder| run.path().join(folder).is_dir()));
+    fs::write(run.log_path("evaluator"), "kept").unwrap();
+    let again = zoo.open("lift", &runs).unwrap();
+    assert_eq!(fs::read_to_string(again.log_path("evaluator")).unwrap(), "kept");
+    assert_eq!(runs.read_dir().unwrap().count(), 1, "nothing temporary remains");
+}
+
+#[test]
+fn an_unknown_name_is_rejected_with_the_known_ones() {
+    let (_package, zoo) = package();
+    let home = tempfile::tempdir().unwrap();
+    for name in ["drop", "", "..", "lift/../lift"] {
+        let error = zoo.open(name, home.path()).unwrap_err();
+        assert!(error.downcast_ref::<WrongUse>().is_some(), "{name}");
+        assert!(error.to_string().contains("expected one of lift"), "{error}");
+    }
+    assert_eq!(home.path().read_dir().unwrap().count(), 0);
+}
+
+#[test]
+fn another_run_in_the_place_of_the_copy_is_not_used() {
+    let (_package, zoo) = package();
+    let runs = tempfile::tempdir().unwrap();
+    let manifest = Manifest::new(None).unwrap();
+    let place = runs.path().join("zoo-lift");
+    RunDirectory::create(&place, &ExperimentConfig::default(), &manifest).unwrap();
+    let error = zoo.open("lift", runs.path()).unwrap_err().to_string();
+    assert!(error.contains("zoo-lift is another run"), "{error}");
+}
