@@ -1,42 +1,50 @@
-"""Adds a finished run's last policy to the Python package: ``python deploy/zoo.py RUN [NAME]``.
+"""Adds a run's latest policy to the Python package: ``python deploy/zoo.py RUN [NAME]``.
 
-The run's last evaluation must have 100 episodes (``--set evaluation.final_episodes=100``), and its
-program must have been built from a commit without changes. The copy names no path of this machine.
+It evaluates the policy over 100 episodes. The run must be of a program that was built from a commit
+without changes. The copy names no path of this machine.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
-ZOO = Path(__file__).parents[1] / "envs_py" / "dmprl" / "zoo"
+ROOT = Path(__file__).parents[1]
+ZOO = ROOT / "envs_py" / "dmprl" / "zoo"
 EPISODES = 100
 
 
 def add(run: Path, name: str | None) -> Path:
-    """Writes the folder of a run's last policy, and returns it."""
-    rows = [json.loads(line) for line in (run / "evaluations.jsonl").read_text().splitlines()]
-    last, manifest = rows[-1], json.loads((run / "manifest.json").read_text())
-    if len(last["returns"]) != EPISODES:
-        sys.exit(f"{run}: the last evaluation has {len(last['returns'])} episodes, not {EPISODES}")
-    config = (run / "config.toml").read_text()
-    task = next(line for line in config.splitlines() if line.startswith("name = "))
+    """Writes the folder of a run's latest policy, and returns it."""
+    manifest = json.loads((run / "manifest.json").read_text())
     for session in manifest["sessions"]:
-        if session["git_commit"] is None or session["git_commit"].endswith("-dirty"):
+        if (session["git_commit"] or "-dirty").endswith("-dirty"):
             sys.exit(f"{run}: made by a program of no commit: {session['git_commit']}")
         session["command"] = ["dmprl", *without_paths(session["command"][1:])]
-    target = ZOO / (name or task.split('"')[1])
+    row = evaluated(run)
+    config = (run / "config.toml").read_text()
+    target = ZOO / (name or tomllib.loads(config)["task"]["name"])
     shutil.rmtree(target, ignore_errors=True)
     (target / "policies").mkdir(parents=True)
     (target / "config.toml").write_text(config)
     (target / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
-    (target / "evaluations.jsonl").write_text(json.dumps(last) + "\n")
+    (target / "evaluations.jsonl").write_text(json.dumps(row) + "\n")
     shutil.copy(run / "spec.json", target)
-    policy = f"policies/{last['policy_version']}.safetensors"
+    policy = f"policies/{row['policy_version']}.safetensors"
     shutil.copy(run / policy, target / policy)
     return target
+
+
+def evaluated(run: Path) -> dict[str, object]:
+    """Returns a row of ``evaluations.jsonl`` for the latest policy."""
+    options = ["--policy", "latest", "--episodes", str(EPISODES), "--json"]
+    command = [str(ROOT / "target/release/dmprl"), "eval", str(run), *options]
+    row = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+    return {key: row[key] for key in row if key not in ("run", "return_std", "episodes")}
 
 
 def without_paths(words: list[str]) -> list[str]:

@@ -64,8 +64,9 @@ class Policy:
 
     @classmethod
     def load(cls, path: str | Path) -> Policy:
-        """Loads a policy file of ``dmprl export``, the best policy of a run directory, or one that
-        comes with the package (``zoo:panda-reach``).
+        """Loads a policy file, the best policy of a run directory, or ``zoo:TASK``.
+
+        ``dmprl export`` writes policy files; those of :mod:`dmprl.zoo` come with the package.
 
         :raises OSError: if it cannot be read.
         :raises dmprl.PolicyFileError: if it is not a policy file, is damaged, or is too old.

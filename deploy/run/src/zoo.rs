@@ -58,8 +58,7 @@ impl Zoo {
     /// Opens the copy of a policy in the folder `runs`, and makes it first if there is none.
     ///
     /// # Errors
-    /// Wrong use: there is no such policy, or another run has the place of the copy. Also an I/O
-    /// error.
+    /// Wrong use: the name is unknown, or another run has the place of the copy. Also an I/O error.
     pub fn open(&self, name: &str, runs: &Path) -> anyhow::Result<RunDirectory> {
         let names = self.names()?;
         if !names.iter().any(|known| known == name) {

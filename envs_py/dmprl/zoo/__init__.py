@@ -24,7 +24,7 @@ def names() -> list[str]:
 def path(name: str | Path) -> Path | None:
     """Returns the file of the policy ``zoo:NAME``, or None if this is the path of another file.
 
-    :raises dmprl.PolicyFileError: if there is no such policy.
+    :raises dmprl.PolicyFileError: if the name is unknown.
     """
     if not str(name).startswith(PREFIX):
         return None

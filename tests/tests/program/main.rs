@@ -55,6 +55,7 @@ mod start_stop;
 mod sweep;
 mod trust;
 mod variants;
+mod zoo;
 
 /// Settings of a cheap run: small networks, few updates, and frequent output of every kind.
 const SMALL: [&str; 9] = [
