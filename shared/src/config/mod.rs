@@ -1,6 +1,7 @@
 //! Stage 1 of 8: the typed configuration of an experiment and its defaults.
 //!
-//! Precedence, lowest first: task defaults, preset, file, environment variables, `--set` and flags.
+//! Precedence, lowest first: task defaults, preset, the task's values for that preset, file,
+//! environment variables, `--set` and flags.
 //! `layers` merges them as TOML tables. It rejects unknown keys and suggests the nearest known one.
 //! `resolve` fills in values that depend on others and checks all of them. Every default of the
 //! system is in this folder.
