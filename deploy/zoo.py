@@ -23,10 +23,13 @@ def add(run: Path, name: str | None) -> Path:
     manifest = json.loads((run / "manifest.json").read_text())
     for session in manifest["sessions"]:
         if (session["git_commit"] or "-dirty").endswith("-dirty"):
-            sys.exit(f"{run}: made by a program of no commit: {session['git_commit']}")
+            sys.exit(f"{run}: trained by a build with uncommitted changes: {session['git_commit']}")
         session["command"] = ["dmprl", *without_paths(session["command"][1:])]
-    row = evaluated(run)
     config = (run / "config.toml").read_text()
+    # Paths of demonstrations, modules and secrets are on one line of their own each.
+    if '"/' in config or manifest["init_from"]:
+        sys.exit(f"{run}: its config.toml or manifest names a file of this machine")
+    row = evaluated(run)
     target = ZOO / (name or tomllib.loads(config)["task"]["name"])
     shutil.rmtree(target, ignore_errors=True)
     (target / "policies").mkdir(parents=True)

@@ -36,6 +36,8 @@ class ZooTest(unittest.TestCase):
             self.assertEqual(session["command"][:3], ["dmprl", "train", name])
             self.assertFalse(session["git_commit"].endswith("-dirty"), name)
             self.assertTrue((folder / f"policies/{row['policy_version']}.safetensors").is_file())
+            for file in ("manifest.json", "config.toml"):
+                self.assertNotIn('"/', (folder / file).read_text(), f"a path in {name}/{file}")
 
     def test_the_cube_is_brought_to_its_goal(self):
         policies = [dmprl.Policy.load("zoo:panda-pick-and-place") for _ in range(20)]
@@ -50,8 +52,9 @@ class ZooTest(unittest.TestCase):
         self.assertGreaterEqual((out.success == SUCCESS_YES).mean(), 0.8)
 
     def test_unknown_names_are_refused_with_the_known_ones(self):
-        with self.assertRaisesRegex(dmprl.PolicyFileError, "zoo:dance; expected .*panda-reach"):
-            dmprl.Policy.load("zoo:dance")
+        for name in ("dance", "../zoo/panda-reach", str(zoo.FOLDER / "panda-reach"), ""):
+            with self.assertRaisesRegex(dmprl.PolicyFileError, f"{name}; expected .*panda-reach"):
+                dmprl.Policy.load(f"zoo:{name}")
         with tempfile.TemporaryDirectory() as folder:
             self.assertIsNone(zoo.path(Path(folder)))
 

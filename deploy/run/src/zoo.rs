@@ -14,6 +14,8 @@ use crate::failure::wrong_use;
 
 /// Begins the name of a policy of the zoo, in place of a run directory's path.
 const PREFIX: &str = "zoo:";
+/// Marks a copy, which `resume` must not start again from the beginning.
+const MARK: &str = "copied-from.txt";
 /// Files of a policy, beside its folder `policies`.
 const FILES: [&str; 4] = ["config.toml", "spec.json", "evaluations.jsonl", "manifest.json"];
 
@@ -34,6 +36,12 @@ impl Zoo {
     #[must_use]
     pub fn name(path: &Path) -> Option<&str> {
         path.to_str()?.strip_prefix(PREFIX)
+    }
+
+    /// Returns whether a run directory is a copy of one of these policies.
+    #[must_use]
+    pub fn is_copy(run: &RunDirectory) -> bool {
+        run.path().join(MARK).is_file()
     }
 
     /// Lists the names.
@@ -70,11 +78,11 @@ impl Zoo {
         let original = RunDirectory::open(&self.folder.join(name))?;
         let place = runs.join(format!("zoo-{name}"));
         if !place.exists() {
-            copy(original.path(), runs, &place)
+            copy(&original, name, runs, &place)
                 .with_context(|| format!("cannot copy {PREFIX}{name} to {}", place.display()))?;
         }
         let copied = RunDirectory::open(&place)?;
-        if copied.manifest()?.run_id == original.manifest()?.run_id {
+        if copied.manifest()? == original.manifest()? {
             return Ok(copied);
         }
         Err(wrong_use(format!(
@@ -85,28 +93,36 @@ impl Zoo {
 }
 
 /// Copies a policy's files, into place at once.
-fn copy(from: &Path, runs: &Path, place: &Path) -> anyhow::Result<()> {
+fn copy(from: &RunDirectory, name: &str, runs: &Path, place: &Path) -> anyhow::Result<()> {
+    let from = from.path();
     fs::create_dir_all(runs)?;
     let folder = tempfile::Builder::new().prefix(".zoo-").tempdir_in(runs)?;
     for name in FOLDERS {
         fs::create_dir(folder.path().join(name))?;
     }
     fs::File::create_new(folder.path().join("metrics.jsonl"))?;
-    for name in FILES {
-        fs::copy(from.join(name), folder.path().join(name)).context(name)?;
+    fs::write(folder.path().join(MARK), format!("{PREFIX}{name}\n"))?;
+    for file in FILES {
+        fs::copy(from.join(file), folder.path().join(file)).context(file)?;
     }
     let policies = from.join("policies");
     for entry in policies.read_dir()? {
         let name = entry?.file_name();
         fs::copy(policies.join(&name), folder.path().join("policies").join(&name))?;
     }
+    RunDirectory::open(folder.path())?.point_best()?;
     // As a run directory of `train`, it is readable for others if the umask allows it.
     let mode = fs::metadata(folder.path().join("policies"))?.permissions();
     fs::set_permissions(folder.path(), mode)?;
-    match fs::rename(folder.keep(), place) {
+    match fs::rename(folder.path(), place) {
+        Ok(()) => {
+            // It has another name now, so nothing is left to remove.
+            let _ = folder.keep();
+            Ok(())
+        }
         // Another command was faster.
         Err(_) if place.exists() => Ok(()),
-        renamed => Ok(renamed?),
+        Err(error) => Err(error.into()),
     }
 }
 

@@ -28,8 +28,8 @@ def path(name: str | Path) -> Path | None:
     """
     if not str(name).startswith(PREFIX):
         return None
-    files = list((FOLDER / str(name).removeprefix(PREFIX)).glob("policies/*.safetensors"))
-    if not files:
-        known = ", ".join(names())
-        raise PolicyFileError(f"there is no policy {name}; expected {PREFIX} and one of {known}")
-    return files[0]
+    task, known = str(name).removeprefix(PREFIX), names()
+    if task not in known:
+        expected = f"{PREFIX} and one of {', '.join(known)}"
+        raise PolicyFileError(f"there is no policy {name}; expected {expected}")
+    return next((FOLDER / task).glob("policies/*.safetensors"))

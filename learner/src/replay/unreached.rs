@@ -22,8 +22,8 @@ const MARGIN: f32 = 0.4;
 const MANY: f64 = 0.1;
 /// Share of the episodes below which few end away, relative to that of the desired goals.
 const FEW: f64 = 0.3;
-/// Number of newest segments among which those that went away are searched, beside all
-/// demonstrations.
+/// Number of newest segments among which those that went away are searched, and of demonstrated
+/// ones.
 const SEARCHED_SEGMENTS: usize = 50_000;
 /// Draws after which a window is taken from another episode.
 const DRAWS_MAX: usize = 20;
@@ -84,7 +84,7 @@ impl Unreached {
         if unreached.any() {
             let is_away =
                 |&slot: &u32| unreached.contains(region, rule.achieved(replay.last_row(slot)));
-            let demonstrated = 0..replay.demonstrations as u32;
+            let demonstrated = (0..replay.demonstrations as u32).take(SEARCHED_SEGMENTS);
             let searched = newest.all(replay).take(SEARCHED_SEGMENTS).chain(demonstrated);
             unreached.slots = searched.filter(is_away).collect();
         }
@@ -246,7 +246,12 @@ mod tests {
             &mut replay,
             numbered(0..50, |number| [if number == 7 { 4.0 } else { 0.0 }, 0.0, 5.0]),
         );
-        assert_eq!(unreached(&replay).slots, [16, 1]);
+        let unreached = unreached(&replay);
+        assert_eq!(unreached.slots, [16, 1]);
+        let random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut sampler = Sampler::new(Windows::Sliding, random);
+        let drawn = (0..200).map(|_| unreached.draw(&replay, &mut sampler).unwrap().slot);
+        assert!(drawn.filter(|&slot| slot < 2).count() > 60);
     }
 
     #[test]

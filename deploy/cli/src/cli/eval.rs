@@ -24,7 +24,7 @@ const RANDOMISE: &str = "task.randomise.";
 
 const HELP: &str = "\
 Uses the evaluation episodes and seeds of training, so it reproduces the stored figures. Writes only
-a log into the run directory.
+a log into the run directory. The first use of zoo:TASK copies it to runs/zoo-TASK.
 
 --set tests the policy with other ranges of task.randomise than it was trained with.
 

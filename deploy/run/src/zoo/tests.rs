@@ -1,6 +1,7 @@
 //! Tests of the copies of policies that come with the package.
 
 use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::supervision::EvaluationRow;
 
 use super::*;
 use crate::failure::WrongUse;
@@ -11,7 +12,20 @@ fn package() -> (tempfile::TempDir, Zoo) {
     let package = tempfile::tempdir().unwrap();
     let folder = package.path().join("zoo/lift");
     let manifest = Manifest::new(None).unwrap();
-    RunDirectory::create(&folder, &ExperimentConfig::default(), &manifest).unwrap();
+    let run = RunDirectory::create(&folder, &ExperimentConfig::default(), &manifest).unwrap();
+    run.append_evaluation(&EvaluationRow {
+        env_steps: 1,
+        updates: 1,
+        segments: 1,
+        wall_s: 1.0,
+        policy_version: 7,
+        returns: vec![-1.0],
+        return_mean: -1.0,
+        success_rate: None,
+        smoothness: 0.5,
+        at_bounds: None,
+    })
+    .unwrap();
     fs::write(folder.join("spec.json"), "{}").unwrap();
     fs::write(folder.join("policies/7.safetensors"), "parameters").unwrap();
     fs::write(package.path().join("zoo/__init__.py"), "").unwrap();
@@ -39,6 +53,38 @@ fn a_policy_is_copied_once_into_a_run_directory() {
     let again = zoo.open("lift", &runs).unwrap();
     assert_eq!(fs::read_to_string(again.log_path("evaluator")).unwrap(), "kept");
     assert_eq!(runs.read_dir().unwrap().count(), 1, "nothing temporary remains");
+}
+
+#[test]
+fn the_copy_is_marked_and_links_its_best_policy() {
+    let (_package, zoo) = package();
+    let runs = tempfile::tempdir().unwrap();
+    let run = zoo.open("lift", runs.path()).unwrap();
+    assert!(Zoo::is_copy(&run));
+    let best = fs::read_to_string(run.checkpoints_path().join("best")).unwrap();
+    assert_eq!(best, "parameters");
+}
+
+#[test]
+fn a_command_that_copies_at_the_same_time_leaves_nothing_behind() {
+    let (_package, zoo) = package();
+    let runs = tempfile::tempdir().unwrap();
+    let run = zoo.open("lift", runs.path()).unwrap();
+    let original = RunDirectory::open(&zoo.folder.join("lift")).unwrap();
+    copy(&original, "lift", runs.path(), run.path()).unwrap();
+    assert_eq!(runs.path().read_dir().unwrap().count(), 1);
+}
+
+#[test]
+fn a_copy_of_an_older_version_is_not_used() {
+    let (_package, zoo) = package();
+    let runs = tempfile::tempdir().unwrap();
+    zoo.open("lift", runs.path()).unwrap();
+    let original = RunDirectory::open(&zoo.folder.join("lift")).unwrap();
+    let longer = Manifest { init_from: Some("zoo:lift".into()), ..original.manifest().unwrap() };
+    original.write_manifest(&longer).unwrap();
+    let error = zoo.open("lift", runs.path()).unwrap_err().to_string();
+    assert!(error.contains("of another version of dmprl"), "{error}");
 }
 
 #[test]
