@@ -72,6 +72,7 @@ pages! {
     every_block_about_trouble_runs: "docs/troubleshooting.md",
     every_block_about_results_runs: "docs/results.md",
     every_block_about_benchmarks_runs: "docs/benchmarks.md",
+    every_block_about_trained_policies_runs: "docs/zoo.md",
 }
 
 /// A fenced block of code.
