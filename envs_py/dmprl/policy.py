@@ -379,7 +379,7 @@ def _plan(file: PolicyFile) -> dict[str, Any]:
     if widths[0] != inputs:
         raise ValueError(f"actor.0.weight has {widths[0]} inputs, expected {inputs}")
     # SAC's network outputs the log-stds after the decisions.
-    log_stds_len = steps * spec["action_len"] if description["algorithm"] == "sac" else 0
+    log_stds_len = steps * spec["action_len"] if description["algorithm"] in ("sac", "tqc") else 0
     controlled = 4 if policy["controller"] == "inverse" else 0
     decided = 1 + description["dmp"]["basis_count"] + controlled if is_dmp else steps
     outputs = decided * spec["action_len"] + log_stds_len

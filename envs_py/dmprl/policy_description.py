@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 WORDS = {
-    "algorithm": ("ddpg", "td3", "sac", "ndp"),
+    "algorithm": ("ddpg", "td3", "sac", "tqc", "ndp"),
     "policy.kind": ("dmp", "mlp", "chunk"),
     "policy.controller": ("inverse", "position"),
     "policy.rho": ("bounded", "free"),

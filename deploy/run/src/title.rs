@@ -6,7 +6,7 @@ use dmprl_shared::config::{AlgorithmName, ExperimentConfig, PRESETS, PolicyKind}
 #[must_use]
 pub fn title(config: &ExperimentConfig) -> String {
     let policy = config.policy.kind.name();
-    let algorithm = format!("{:?}", config.algorithm.name).to_lowercase();
+    let algorithm = config.algorithm.name.name();
     let actors = &config.actors;
     let count =
         |count: usize, what: &str| format!("{count} {what}{}", if count == 1 { "" } else { "s" });
@@ -34,6 +34,7 @@ fn method(config: &ExperimentConfig) -> String {
         AlgorithmName::Ddpg => "DDPG",
         AlgorithmName::Td3 => "TD3",
         AlgorithmName::Sac => "SAC",
+        AlgorithmName::Tqc => "TQC",
         // Its policy is always a DMP.
         AlgorithmName::Ndp => return "NDP".to_owned(),
     };

@@ -40,9 +40,9 @@ pub struct BatchShape {
     pub segment_actions_len: usize,
     /// Length A of an action.
     pub action_len: usize,
-    /// Whether the target needs noise (TD3 and SAC).
+    /// Whether the target needs noise (TD3, SAC and TQC).
     pub next_noise: bool,
-    /// Whether the actor's step needs noise (SAC).
+    /// Whether the actor's step needs noise (SAC and TQC).
     pub noise: bool,
     /// Shape of the outcome model, if the critics see one.
     pub outcome: Option<OutcomeShape>,
@@ -64,8 +64,8 @@ impl BatchShape {
             end_state_len: if whole { carried } else { 0 },
             segment_actions_len,
             action_len: layout.action_len,
-            next_noise: matches!(config.name, AlgorithmName::Td3 | AlgorithmName::Sac),
-            noise: config.name == AlgorithmName::Sac,
+            next_noise: config.name == AlgorithmName::Td3 || config.name.has_gaussian_policy(),
+            noise: config.name.has_gaussian_policy(),
             outcome: rule
                 .filter(|_| config.outcome_model && whole)
                 .and_then(|rule| OutcomeShape::new(rule, layout.segment_steps)),

@@ -1,7 +1,8 @@
 //! The learning algorithms. Each has its own file, to be read next to its paper.
 //!
-//! [`Algorithm`] is one of those that learn from a replay: DDPG, TD3 and SAC. NDP ([`ndp`]) learns
-//! from rollouts. [`crate::regime`] selects between the two.
+//! [`Algorithm`] is one of those that learn from a replay: DDPG, TD3 and SAC, with kernels, and
+//! those that only `graph` has. NDP ([`ndp`]) learns from rollouts. [`crate::regime`] selects
+//! between the two.
 
 pub(crate) mod batch;
 mod batch_shard;
@@ -26,10 +27,11 @@ use dmprl_shared::seeds;
 pub use batch::{Batch, BatchShape, NoWindow, SampleSource};
 pub use losses::Losses;
 
-use crate::graph::Graph;
+use crate::graph::{self, Graph, NamedNetworks};
 use crate::update::network::TrainableNetwork;
 use crate::update::thread_pool::ThreadPool;
 use ddpg::Ddpg;
+pub(crate) use outcome::new_outcome_model;
 use sac::Sac;
 use td3::Td3;
 
@@ -42,7 +44,7 @@ pub struct Algorithm {
     replica: Option<DeviceReplica>,
 }
 
-/// A copy of the networks on another device, where updates run.
+/// A copy of the networks on a device, where updates run as graphs.
 #[derive(Debug)]
 struct DeviceReplica {
     config: ExperimentConfig,
@@ -64,6 +66,8 @@ enum Kind {
     Ddpg(Box<Ddpg>),
     Td3(Box<Td3>),
     Sac(Box<Sac>),
+    /// An algorithm without kernels: its networks, the actor first.
+    Graph(NamedNetworks),
 }
 
 impl Algorithm {
@@ -83,12 +87,14 @@ impl Algorithm {
             AlgorithmName::Ddpg => Kind::Ddpg(Box::new(Ddpg::new(config, policy, shape)?)),
             AlgorithmName::Td3 => Kind::Td3(Box::new(Td3::new(config, policy, shape)?)),
             AlgorithmName::Sac => Kind::Sac(Box::new(Sac::new(config, policy, shape)?)),
+            AlgorithmName::Tqc => Kind::Graph(graph::new_networks(config, policy, shape)?),
             AlgorithmName::Ndp => candle_core::bail!("ndp does not learn from a replay"),
         };
-        let replica = match config.learner.device {
-            config::Device::Cpu => None,
-            config::Device::Cuda => Some(DeviceReplica::new(config, Device::new_cuda(0)?)),
+        let device = match config.learner.device {
+            config::Device::Cpu => Device::Cpu,
+            config::Device::Cuda => Device::new_cuda(0)?,
         };
+        let replica = config.updates_by_graph().then(|| DeviceReplica::new(config, device));
         Ok(Self { shape, pool: ThreadPool::new(config.learner.threads), kind, replica })
     }
 
@@ -116,6 +122,7 @@ impl Algorithm {
             Kind::Ddpg(ddpg) => ddpg.update(policy, batch, pool),
             Kind::Td3(td3) => td3.update(policy, batch, pool, update),
             Kind::Sac(sac) => sac.update(policy, batch, pool),
+            Kind::Graph(_) => candle_core::bail!("the algorithm has no kernels"),
         }
     }
 
@@ -205,6 +212,7 @@ impl Kind {
             Self::Ddpg(ddpg) => &ddpg.actor,
             Self::Td3(td3) => &td3.actor,
             Self::Sac(sac) => &sac.actor,
+            Self::Graph(networks) => &networks[0].1,
         }
     }
 
@@ -213,6 +221,7 @@ impl Kind {
             Self::Ddpg(ddpg) => &mut ddpg.actor,
             Self::Td3(td3) => &mut td3.actor,
             Self::Sac(sac) => &mut sac.actor,
+            Self::Graph(networks) => &mut networks[0].1,
         }
     }
 
@@ -239,6 +248,9 @@ impl Kind {
                 f("log_temperature", &mut sac.log_temperature)?;
                 &mut sac.outcome_model
             }
+            Self::Graph(networks) => {
+                return networks.iter_mut().try_for_each(|(name, network)| f(name, network));
+            }
         };
         outcome_model.as_mut().map_or(Ok(()), |model| f("outcome_model", model))
     }
@@ -259,6 +271,9 @@ impl Kind {
                 let networks = [("actor", &sac.actor), ("critic_1", first), ("critic_2", second)];
                 ([networks.as_slice(), &[temperature]].concat(), &sac.outcome_model)
             }
+            Self::Graph(networks) => {
+                return networks.iter().map(|(name, network)| (*name, network)).collect();
+            }
         };
         networks.extend(outcome_model.as_ref().map(|model| ("outcome_model", model)));
         networks
@@ -266,7 +281,11 @@ impl Kind {
 }
 
 /// Makes an actor with newly drawn parameters.
-fn new_actor(config: &ExperimentConfig, policy: &Policy, target: bool) -> Result<TrainableNetwork> {
+pub(crate) fn new_actor(
+    config: &ExperimentConfig,
+    policy: &Policy,
+    target: bool,
+) -> Result<TrainableNetwork> {
     let mut random = seeds::stream(config.run.seed, "actor parameters", 0);
     let initial = policy.initial_parameters(&mut random);
     let rate = config.algorithm.actor_learning_rate;

@@ -1,6 +1,6 @@
 //! A sample of a batch: a window, with another goal if hindsight draws one.
 
-use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, Target};
+use dmprl_shared::config::{AlgorithmConfig, Target};
 
 use crate::replay::{Goal, GoalSampler, Outcome, Replay, Sampler, Window};
 
@@ -40,9 +40,9 @@ impl<'a> Sample<'a> {
 }
 
 /// Returns the range of the targets: that of the returns that a sparse goal rule allows. The soft
-/// values of SAC and the undiscounted sums of `literal` have no such range.
+/// values of SAC and TQC and the undiscounted sums of `literal` have no such range.
 pub(super) fn target_range(hindsight: Option<&GoalSampler>, config: &AlgorithmConfig) -> [f32; 2] {
-    let is_return = config.target == Target::NStep && config.name != AlgorithmName::Sac;
+    let is_return = config.target == Target::NStep && !config.name.has_gaussian_policy();
     hindsight
         .filter(|_| is_return)
         .and_then(|hindsight| hindsight.return_range(config.discount))

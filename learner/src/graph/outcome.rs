@@ -2,9 +2,9 @@
 
 use candle_core::{D, Result, Tensor};
 
-use super::Graph;
-use super::policy::{DeviceStates, mlp};
-use crate::algorithms::batch::Batch;
+use super::batch::DeviceBatch;
+use super::policy::DeviceStates;
+use super::{Graph, Of};
 
 /// Outcomes of segments.
 pub(super) struct Prediction {
@@ -28,15 +28,15 @@ impl Graph {
     /// Predicts outcomes from critic inputs without features, if there is a model.
     pub(super) fn predict(
         &self,
+        of: Of,
         inputs: &Tensor,
         states: &DeviceStates,
     ) -> Result<Option<Prediction>> {
         let (Some(outcome), Some(starts)) = (self.shape.outcome, &states.goal_distances) else {
             return Ok(None);
         };
-        let model = self.device_network("outcome_model")?;
         let inputs = inputs.narrow(1, 0, self.shape.observation_len + self.shape.actions_len)?;
-        let motion = mlp(&model.shape, None, &model.parameters, &inputs)?;
+        let motion = self.forward("outcome_model", of, &inputs)?;
         let motion = motion.reshape((self.shape.rows, outcome.steps, outcome.goal_len))?;
         let distances = starts.broadcast_sub(&motion)?;
         let length = distances.sqr()?.sum_keepdim(D::Minus1)?.sqrt()?;
@@ -47,18 +47,17 @@ impl Graph {
         Ok(Some(Prediction { motion, features: features.flatten_from(1)? }))
     }
 
-    /// Does a step of the model on the batch's own actions, if there is one. Returns its prediction
-    /// before the step.
-    pub(super) fn outcome_step(
-        &mut self,
-        states: &DeviceStates,
-        batch: &Batch,
-    ) -> Result<Option<Prediction>> {
-        let inputs = self.on_device(&batch.critic_inputs)?;
-        let Some(prediction) = self.predict(&inputs, states)? else { return Ok(None) };
-        let wanted = self.on_device(&batch.motion)?;
-        let loss = (prediction.motion.flatten_from(1)? - wanted)?.sqr()?.mean_all()?;
+    /// Does a step of the model on the batch's own actions, if there is one, and appends its
+    /// prediction before the step to the critic inputs.
+    pub(super) fn outcome_step(&mut self, batch: &mut DeviceBatch) -> Result<()> {
+        let Some(prediction) = self.predict(Of::Network, &batch.critic_inputs, &batch.states)?
+        else {
+            return Ok(());
+        };
+        let loss = (prediction.motion.flatten_from(1)? - &batch.motion)?.sqr()?.mean_all()?;
         self.descend("outcome_model", &loss, false)?;
-        Ok(Some(prediction))
+        let features = prediction.features.detach();
+        batch.critic_inputs = Tensor::cat(&[&batch.critic_inputs, &features], D::Minus1)?;
+        Ok(())
     }
 }

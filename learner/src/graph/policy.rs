@@ -6,7 +6,6 @@ use dmprl_shared::dmp::{Dmp, SegmentMap};
 use dmprl_shared::policy::{Head, MlpShape, Policy};
 
 use crate::update::kernels::VARIANCE_EPSILON;
-use crate::update::layer_norm::{GainShift, LayerNorm};
 
 /// Range of a raw log-std, as in `dmprl_shared::policy::gaussian`.
 const LOG_STD: (f64, f64) = (-20.0, 2.0);
@@ -56,23 +55,19 @@ pub(super) struct DeviceStates {
     pub goal_distances: Option<Tensor>,
 }
 
-/// Computes a multilayer perceptron with flat parameters, with layer normalisation if given.
-pub(super) fn mlp(
-    shape: &MlpShape,
-    layer_norm: Option<&LayerNorm>,
-    flat: &Tensor,
-    inputs: &Tensor,
-) -> Result<Tensor> {
+/// Computes a multilayer perceptron with its variables ([`Variable::of_mlp`]).
+///
+/// [`Variable::of_mlp`]: super::modules::Variable::of_mlp
+pub(super) fn mlp(shape: &MlpShape, tensors: &[Tensor], inputs: &Tensor) -> Result<Tensor> {
+    let layers = shape.layers().len();
+    let (linear, normalised) = tensors.split_at(2 * layers);
     let mut x = inputs.clone();
-    for (index, layer) in shape.layers().iter().enumerate() {
-        let weights = flat.narrow(0, layer.weights.start, layer.weights.len())?;
-        let weights = weights.reshape((layer.outputs, layer.inputs))?;
-        let bias = flat.narrow(0, layer.bias.start, layer.bias.len())?;
-        x = x.matmul(&weights.t()?)?.broadcast_add(&bias)?;
-        if let Some(gain_shift) = layer_norm.and_then(|norm| norm.layer(index)) {
-            x = normalise(&x, gain_shift, flat)?;
+    for (index, layer) in linear.chunks_exact(2).enumerate() {
+        x = x.matmul(&layer[0].t()?)?.broadcast_add(&layer[1])?;
+        if let Some([gain, shift]) = normalised.get(2 * index..2 * index + 2) {
+            x = normalise(&x, gain, shift)?;
         }
-        if index + 1 < shape.layers().len() {
+        if index + 1 < layers {
             x = x.relu()?;
         }
     }
@@ -80,13 +75,11 @@ pub(super) fn mlp(
 }
 
 /// Normalises every row, then applies the layer's gain and shift.
-fn normalise(x: &Tensor, gain_shift: &GainShift, flat: &Tensor) -> Result<Tensor> {
-    let gain = flat.narrow(0, gain_shift.gain.start, gain_shift.gain.len())?;
-    let shift = flat.narrow(0, gain_shift.shift.start, gain_shift.shift.len())?;
+pub(super) fn normalise(x: &Tensor, gain: &Tensor, shift: &Tensor) -> Result<Tensor> {
     let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
     let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
     let std = (variance + f64::from(VARIANCE_EPSILON))?.sqrt()?;
-    centred.broadcast_div(&std)?.broadcast_mul(&gain)?.broadcast_add(&shift)
+    centred.broadcast_div(&std)?.broadcast_mul(gain)?.broadcast_add(shift)
 }
 
 impl PolicyGraph {
@@ -99,9 +92,9 @@ impl PolicyGraph {
         Ok(Self { shape: policy.shape().clone(), log_std_columns, dmp })
     }
 
-    /// Computes the decisions of a network with parameters `flat`.
-    pub(super) fn means(&self, flat: &Tensor, states: &DeviceStates) -> Result<Means> {
-        let outputs = mlp(&self.shape, None, flat, &states.inputs)?;
+    /// Computes the decisions of a network with these variables.
+    pub(super) fn means(&self, tensors: &[Tensor], states: &DeviceStates) -> Result<Means> {
+        let outputs = mlp(&self.shape, tensors, &states.inputs)?;
         let columns = self.log_std_columns.clone();
         let raw_log_stds = columns.map(|c| outputs.narrow(1, c.start, c.len())).transpose()?;
         let head_len = self.log_std_columns.as_ref().map_or(self.shape.outputs(), |c| c.start);

@@ -13,8 +13,36 @@ pub enum AlgorithmName {
     Td3,
     /// Soft actor-critic with a learned temperature (Haarnoja et al. 2018b).
     Sac,
+    /// Truncated quantile critics (Kuznetsov et al. 2020), as a graph.
+    Tqc,
     /// Neural Dynamic Policies (Bahl et al. 2020): proximal policy optimisation, on-policy.
     Ndp,
+}
+
+impl AlgorithmName {
+    /// Returns the name in configuration files and of run directories.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Ddpg => "ddpg",
+            Self::Td3 => "td3",
+            Self::Sac => "sac",
+            Self::Tqc => "tqc",
+            Self::Ndp => "ndp",
+        }
+    }
+
+    /// Returns true if the policy is SAC's: a squashed Gaussian whose spread the network outputs.
+    #[must_use]
+    pub fn has_gaussian_policy(self) -> bool {
+        matches!(self, Self::Sac | Self::Tqc)
+    }
+
+    /// Returns true if there are no kernels for the algorithm, only a graph.
+    #[must_use]
+    pub fn is_graph_only(self) -> bool {
+        self == Self::Tqc
+    }
 }
 
 /// Actions that the critic sees.
@@ -72,10 +100,10 @@ pub struct AlgorithmConfig {
     /// Widths of the critic's hidden layers.
     pub critic_hidden: Vec<usize>,
     /// Applies layer normalisation (Ba et al. 2016) to the critic's hidden layers, before their
-    /// ReLU, in DDPG, TD3 and SAC. It bounds Q for actions unlike any in the replay (Ball et al.
+    /// ReLU, in all but `ndp`. It bounds Q for actions unlike any in the replay (Ball et al.
     /// 2023).
     pub critic_layer_norm: bool,
-    /// Weight of a penalty on the action rate in the actor's loss (DDPG, TD3 and SAC). The penalty
+    /// Weight of a penalty on the action rate in the actor's loss (not with `ndp`). The penalty
     /// is the sum of (u_t - u_{t-1})² over a decision's noise-free actions and their dimensions.
     /// The weight is relative to the batch's mean |Q|, so it does not depend on the scale of the
     /// rewards. The action before the first one is read from the replay. Larger values give
@@ -87,14 +115,16 @@ pub struct AlgorithmConfig {
     /// sparse. Afterwards it is the reward of a step that ends away in a coordinate of the goals
     /// that is unreached, such as the height (docs/algorithm.md).
     pub motion_bonus: f64,
-    /// Whether the critics of DDPG, TD3 and SAC also see how far from the desired goal a model
+    /// Whether the critics also see how far from the desired goal a model
     /// expects the achieved goal after each step of the segment. The model learns from the same
     /// batches. It needs an environment with a sparse goal rule and `critic = "segment"`.
     pub outcome_model: bool,
     /// Settings of TD3.
     pub td3: Td3Config,
-    /// Settings of SAC.
+    /// Settings of SAC, and of TQC's temperature.
     pub sac: SacConfig,
+    /// Settings of TQC's critics.
+    pub tqc: TqcConfig,
     /// Settings of `ndp`.
     pub ndp: NdpConfig,
 }
@@ -149,6 +179,24 @@ impl Default for SacConfig {
     }
 }
 
+/// Settings of TQC's critics.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct TqcConfig {
+    /// Number of critics.
+    pub critics: usize,
+    /// Quantiles of the return that each critic predicts.
+    pub quantiles: usize,
+    /// Largest quantiles that are left out of the target, for each critic.
+    pub dropped_quantiles: usize,
+}
+
+impl Default for TqcConfig {
+    fn default() -> Self {
+        Self { critics: 2, quantiles: 25, dropped_quantiles: 2 }
+    }
+}
+
 impl Default for AlgorithmConfig {
     fn default() -> Self {
         Self {
@@ -168,6 +216,7 @@ impl Default for AlgorithmConfig {
             outcome_model: false,
             td3: Td3Config::default(),
             sac: SacConfig::default(),
+            tqc: TqcConfig::default(),
             ndp: NdpConfig::default(),
         }
     }
@@ -254,7 +303,7 @@ pub enum WarmUpKind {
 }
 
 /// Exploration noise of the rollout. `kind` and `std` have no effect on policies that explore by
-/// sampling from their own action distribution (SAC and `ndp`).
+/// sampling from their own action distribution (SAC, TQC and `ndp`).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExplorationConfig {

@@ -52,6 +52,14 @@ impl ExperimentConfig {
     pub fn places(&self) -> usize {
         self.actors.places().saturating_add(self.bridge.places())
     }
+
+    /// Returns true if updates are graphs, not kernels.
+    #[must_use]
+    pub fn updates_by_graph(&self) -> bool {
+        let configured = self.learner.backend == Backend::Graph;
+        let on_cpu = self.learner.device == Device::Cpu;
+        configured || !on_cpu || self.algorithm.name.is_graph_only()
+    }
 }
 
 /// Length, seed and stopping rules.
@@ -351,6 +359,17 @@ pub enum Device {
     Cuda,
 }
 
+/// What computes an update on the CPU.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Backend {
+    /// Our own kernels with gradients derived by hand, the fastest.
+    Kernels,
+    /// Losses on candle's graph with automatic differentiation: for new algorithms, and to check
+    /// the kernels.
+    Graph,
+}
+
 /// Precision of the multiplications in an update. Sums and parameters are always f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -368,7 +387,12 @@ pub enum Precision {
 pub struct LearnerConfig {
     /// Device that computes the updates.
     pub device: Device,
-    /// Threads that compute an update. Results are bit-identical for every number of threads.
+    /// What computes an update on the CPU. On another device it is always the graph, and `tqc` has
+    /// nothing else.
+    pub backend: Backend,
+    /// Threads that compute an update by kernels. Results are bit-identical for every number of
+    /// threads. A graph on the CPU uses one, unless the environment variable `RAYON_NUM_THREADS`
+    /// has more.
     pub threads: usize,
     /// Precision of the multiplications in an update. Sums and parameters are always f32.
     pub precision: Precision,
@@ -380,6 +404,7 @@ impl Default for LearnerConfig {
     fn default() -> Self {
         Self {
             device: Device::Cpu,
+            backend: Backend::Kernels,
             threads: 1,
             precision: Precision::F32,
             publish_every_updates: 4,

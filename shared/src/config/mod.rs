@@ -19,14 +19,14 @@ mod tasks;
 
 pub use algorithm::{
     AlgorithmConfig, AlgorithmName, CriticInput, ExplorationConfig, ExplorationKind,
-    LearningRateDecay, NdpConfig, SacConfig, Target, Td3Config, WarmUpKind, Windows,
+    LearningRateDecay, NdpConfig, SacConfig, Target, Td3Config, TqcConfig, WarmUpKind, Windows,
 };
 pub use dmp::{
     BasisWidths, CanonicalIntegration, Controller, DmpConfig, ForcingScaling, Integrator,
     PolicyConfig, PolicyKind, RhoKind, Start, StartSource, StartVelocity,
 };
 pub use experiment::{
-    ActorsConfig, BridgeConfig, CheckpointConfig, DeliveryConfig, DeliveryLevel,
+    ActorsConfig, Backend, BridgeConfig, CheckpointConfig, DeliveryConfig, DeliveryLevel,
     DemonstrationsConfig, Device, EvaluationConfig, ExperimentConfig, Hindsight, LearnerConfig,
     MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, SupervisionConfig,
 };

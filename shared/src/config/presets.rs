@@ -203,16 +203,16 @@ pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
 /// Returns the published settings of an algorithm, which are merged over task and preset. The
 /// user's values override them.
 ///
-/// Presets are made for DDPG, TD3 and SAC. `ndp` needs a different start, integrator and forcing
-/// term.
+/// Presets are made for algorithms with a replay. `ndp` needs a different start, integrator and
+/// forcing term.
 ///
 /// # Panics
 /// Never: a test parses it.
 #[must_use]
 pub fn algorithm_defaults(name: AlgorithmName) -> Option<Table> {
     match name {
-        AlgorithmName::Ddpg | AlgorithmName::Td3 | AlgorithmName::Sac => None,
         AlgorithmName::Ndp => Some(NDP.parse().expect("the built-in defaults are valid TOML")),
+        _ => None,
     }
 }
 
@@ -273,7 +273,7 @@ mod tests {
             let missing: Vec<_> = keys(&all, section).into_iter().filter(missing).collect();
             // The kind of policy and the settings of other algorithms are the user's choice.
             let is_from_paper = |key: &String| {
-                !["kind", "td3", "sac", "ndp", "position_scale"].contains(&key.as_str())
+                !["kind", "td3", "sac", "tqc", "ndp", "position_scale"].contains(&key.as_str())
             };
             let missing: Vec<_> = missing.into_iter().filter(is_from_paper).collect();
             assert!(missing.is_empty(), "{section}: {missing:?}");

@@ -1,9 +1,11 @@
 //! Checks the merged configuration: ranges, combinations and limits.
 
+mod algorithms;
+
 use super::endpoint::{is_endpoint, is_plain};
 use super::{
-    AlgorithmName, ConfigError, Controller, CriticInput, DeliveryLevel, ExperimentConfig,
-    PolicyKind, Start, WarmUpKind, Windows,
+    AlgorithmName, ConfigError, CriticInput, DeliveryLevel, ExperimentConfig, PolicyKind, Start,
+    WarmUpKind, Windows,
 };
 
 /// Properties of the machine, passed in by the caller.
@@ -73,6 +75,8 @@ impl ExperimentConfig {
         }
         self.check_combinations()?;
         self.check_ndp()?;
+        self.check_tqc()?;
+        self.check_precision()?;
         self.check_delivery()?;
         self.check_bridge()?;
         Ok(self)
@@ -316,75 +320,6 @@ impl ExperimentConfig {
             )
         })
     }
-
-    fn check_ndp(&self) -> Result<(), ConfigError> {
-        let ndp = &self.algorithm.ndp;
-        let counts = [
-            ("algorithm.ndp.rollout_segments", ndp.rollout_segments, 1 << 24),
-            ("algorithm.ndp.epochs", ndp.epochs, 10_000),
-            ("algorithm.ndp.minibatches", ndp.minibatches, 1 << 24),
-        ];
-        for (key, got, high) in counts {
-            range(key, got, (1..=high).contains(&got), || format!("from 1 to {high}"))?;
-        }
-        let positive = [
-            ("algorithm.ndp.clip", ndp.clip),
-            ("algorithm.ndp.gradient_norm_max", ndp.gradient_norm_max),
-            ("policy.position_scale", self.policy.position_scale),
-        ];
-        for (key, got) in positive {
-            range(key, got, got.is_finite() && got > 0.0, || "a positive number".into())?;
-        }
-        let lambda = ndp.gae_lambda;
-        let fits = (0.0..=1.0).contains(&lambda);
-        range("algorithm.ndp.gae_lambda", lambda, fits, || "from 0 to 1".into())?;
-        let entropy = ndp.entropy_coefficient;
-        let fits = entropy.is_finite() && entropy >= 0.0;
-        range("algorithm.ndp.entropy_coefficient", entropy, fits, || "0 or more".into())?;
-        let log_std = ndp.initial_log_std;
-        let fits = (-10.0..=2.0).contains(&log_std);
-        range("algorithm.ndp.initial_log_std", log_std, fits, || "from -10 to 2".into())?;
-        let on_policy = self.algorithm.name == AlgorithmName::Ndp;
-        let kind = self.policy.kind;
-        range("policy.kind", kind.name(), !on_policy || kind == PolicyKind::Dmp, || {
-            "dmp with algorithm.name = \"ndp\", which learns only movement primitives".into()
-        })?;
-        let warm_up = self.exploration.warm_up_steps;
-        range("exploration.warm_up_steps", warm_up, !on_policy || warm_up == 0, || {
-            "0 with algorithm.name = \"ndp\", which learns only from actions of its own policy"
-                .into()
-        })?;
-        let on_cpu = self.learner.device == super::Device::Cpu;
-        let bf16 = self.learner.precision == super::Precision::Bf16;
-        range("learner.precision", "bf16", on_cpu || !bf16, || {
-            "f32 with learner.device = \"cuda\"; bf16 runs only on the CPU".into()
-        })?;
-        range("learner.device", "cuda", !on_policy || on_cpu, || {
-            "cpu with algorithm.name = \"ndp\", whose minibatches are too small for a GPU".into()
-        })?;
-        let relabels = self.replay.hindsight != super::Hindsight::None;
-        range("replay.hindsight", "future", !on_policy || !relabels, || {
-            "none with algorithm.name = \"ndp\", which has no replay".into()
-        })?;
-        let demonstrated = !self.demonstrations.files.is_empty();
-        range("demonstrations.files", "files", !on_policy || !demonstrated, || {
-            "none with algorithm.name = \"ndp\", which has no replay".into()
-        })?;
-        let layer_norm = self.algorithm.critic_layer_norm;
-        range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {
-            "false with algorithm.name = \"ndp\"; only ddpg, td3 and sac support it".into()
-        })?;
-        let penalty = self.algorithm.action_rate_penalty;
-        range("algorithm.action_rate_penalty", penalty, !on_policy || penalty == 0.0, || {
-            "0 with algorithm.name = \"ndp\"; only ddpg, td3 and sac support it".into()
-        })?;
-        let position = self.policy.controller == Controller::Position;
-        let dmp = self.policy.kind == PolicyKind::Dmp;
-        range("policy.controller", "position", on_policy || !position || !dmp, || {
-            "inverse, or algorithm.name = \"ndp\", the only algorithm that clips unbounded actions"
-                .into()
-        })
-    }
 }
 
 fn range(
@@ -456,7 +391,7 @@ mod tests {
         let other = ["mlp", "chunk"].map(|kind| error(("policy.kind", kind)));
         assert!(other.iter().all(|text| text.contains("only movement primitives")), "{other:?}");
         assert!(error(("exploration.warm_up_steps", "1")).contains("its own policy"));
-        assert!(error(("algorithm.action_rate_penalty", "0.1")).contains("td3 and sac"));
+        assert!(error(("algorithm.action_rate_penalty", "0.1")).contains("the other algorithms"));
         assert!(error(("policy.start", "observed")).contains("start_sources"));
     }
 
@@ -474,6 +409,8 @@ mod tests {
             ("exploration.random_segments", "-0.1"),
             ("exploration.settled_share", "1.1"),
             ("algorithm.td3.target_smaller_weight", "1.1"),
+            ("algorithm.tqc.critics", "11"),
+            ("algorithm.tqc.dropped_quantiles", "25"),
             ("actors.workers", "1000000"),
             ("actors.env_call_timeout_s", "0"),
             ("actors.env_call_timeout_s", "inf"),

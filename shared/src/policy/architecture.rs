@@ -38,7 +38,7 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
         PolicyKind::Chunk => list.push_str(&format!(" chunk {}", config.policy.segment_steps)),
         PolicyKind::Dmp => list.push_str(&dmp(config, spec)),
     }
-    if config.algorithm.name == AlgorithmName::Sac {
+    if config.algorithm.name.has_gaussian_policy() {
         list.push_str(" squashed gaussian");
     }
     if config.algorithm.name == AlgorithmName::Ndp {

@@ -38,7 +38,7 @@ pub use matrix::{Keep, Matrix, product};
 pub use network::{Activations, Layer, MlpShape, SmallBatchNetwork, forward, initial_parameters};
 pub use tanh::tanh;
 
-use crate::config::{AlgorithmName, ConfigError, Controller, ExperimentConfig, PolicyKind};
+use crate::config::{ConfigError, Controller, ExperimentConfig, PolicyKind};
 use crate::dmp::DmpError;
 use crate::segment::{ActionBounds, SegmentLayout};
 use crate::spec::{EnvSpec, SpecError};
@@ -129,7 +129,7 @@ impl Policy {
             Head::Mlp => layout.actions_len(),
             Head::Dmp(head) => head.outputs_len(),
         };
-        let gaussian = config.algorithm.name == AlgorithmName::Sac;
+        let gaussian = config.algorithm.name.has_gaussian_policy();
         let outputs = head_outputs + if gaussian { layout.actions_len() } else { 0 };
         let mut widths = vec![layout.observation_len];
         widths.extend(&config.policy.hidden);

@@ -1,4 +1,4 @@
-"""One update of DDPG, TD3 and SAC over segments, as their papers write them.
+"""One update of DDPG, TD3, SAC and TQC over segments, as their papers write them.
 
 Each class has `networks` (name -> module), `losses` (name -> number) of the last update and
 `targets`, the critics' regression targets. A batch maps names to tensors; see the README.
@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import torch
 from networks import follow, mlp
 from policies import make_policy, seen_by_critic
-from torch.nn.functional import softplus
+from torch.nn.functional import huber_loss, softplus
 
 SMOOTHING_STD = 0.2
 SMOOTHING_MAX = 0.5
 ACTOR_EVERY = 2
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 TEMPERATURE_LEARNING_RATE = 3e-4
+QUANTILES, DROPPED = 25, 2
 
 
 def adam(parameters, learning_rate):
@@ -197,4 +198,59 @@ class Sac(ActorCritic):
         self.losses["temperature"] = loss.detach()
 
 
-ALGORITHMS = {"ddpg": Ddpg, "td3": Td3, "sac": Sac}
+class Tqc(Sac):
+    """Kuznetsov et al. 2020, Algorithm 1: SAC whose critics predict quantiles of the return."""
+
+    def __init__(self, settings, kit):
+        super().__init__(settings, kit)
+        inputs = settings.policy_observation_len + settings.critic_action_len
+        self.critics = [mlp(inputs, settings.critic_hidden, QUANTILES) for _ in range(2)]
+        self.critic_targets = copy.deepcopy(self.critics)
+        both = [values for critic in self.critics for values in critic.parameters()]
+        self.critic_adam = kit.adam(both, settings.critic_learning_rate)
+
+    def quantiles(self, critics, observations, actions, end):
+        """All quantiles of all critics, (B, critics * M)."""
+        seen = seen_by_critic(self.settings, actions, end)
+        inputs = torch.cat([observations, seen], dim=1)
+        return torch.cat([critic(inputs) for critic in critics], dim=1)
+
+    def update(self, batch):
+        """Critics, actor, temperature, targets of the critics."""
+        self.updates += 1
+        temperature = self.log_temperature.detach().exp()
+        with torch.no_grad():
+            following = batch["next_observations"]
+            actions, end, log_pi = self.draw(following, batch["next_noise"])
+            atoms = self.quantiles(self.critic_targets, following, actions, end)
+            atoms = atoms.sort(dim=1).values[:, : len(self.critics) * (QUANTILES - DROPPED)]
+            atoms = atoms - temperature * log_pi[:, None]
+            targets = batch["rewards"][:, None] + batch["bootstrap"][:, None] * atoms
+        loss = sum(
+            quantile_huber(critic(batch["critic_inputs"]), targets) for critic in self.critics
+        )
+        self.critic_adam.zero_grad()
+        loss.backward()
+        self.critic_adam.step()
+        self.losses = {"critic": loss.detach()}
+        actions, end, log_pi = self.draw(batch["observations"], batch["noise"])
+        q = self.quantiles(self.critics, batch["observations"], actions, end).mean(dim=1)
+        self.actor_step((temperature * log_pi - q).mean())
+        self.temperature_step(log_pi.detach())
+        self.follow_critics()
+
+
+def quantile_huber(quantiles, targets):
+    """Equations 8 and 9: the mean over batch, quantiles (B, M) and targets (B, T)."""
+    count = quantiles.shape[1]
+    fractions = (torch.arange(count, dtype=quantiles.dtype) + 0.5) / count
+    total = 0.0
+    for index in range(count):
+        delta = targets - quantiles[:, index : index + 1]
+        error = huber_loss(delta, torch.zeros_like(delta), reduction="none")
+        weight = torch.where(delta < 0, 1.0 - fractions[index], fractions[index])
+        total = total + (weight * error).mean()
+    return total / count
+
+
+ALGORITHMS = {"ddpg": Ddpg, "td3": Td3, "sac": Sac, "tqc": Tqc}

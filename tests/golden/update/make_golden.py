@@ -16,6 +16,8 @@ from pathlib import Path
 import torch
 from algorithms import (
     ALGORITHMS,
+    DROPPED,
+    QUANTILES,
     SMOOTHING_MAX,
     SMOOTHING_STD,
     TEMPERATURE_LEARNING_RATE,
@@ -29,7 +31,7 @@ SEED = 20250611
 UPDATES = 20
 # Updates of which losses, gradients and targets are kept. TD3's second is the first that moves the
 # actor.
-DETAILED = {"ddpg": (1,), "td3": (1, 2), "sac": (1,)}
+DETAILED = {"ddpg": (1,), "td3": (1, 2), "sac": (1,), "tqc": (1,)}
 # A quarter of the tolerances of the test that reads the files.
 LOST_AT_FIRST, LOST_AT_LAST = 2.5e-6, 2.5e-5
 
@@ -60,6 +62,7 @@ CASES = {
     "ddpg": list(VARIANTS),
     "td3": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_first"],
     "sac": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_first"],
+    "tqc": ["dmp", "mlp", "chunk", "dmp_carry"],
 }
 
 
@@ -108,7 +111,11 @@ def configuration(case):
         keys["algorithm.td3.target_noise_std"] = SMOOTHING_STD
         keys["algorithm.td3.target_noise_clip"] = SMOOTHING_MAX
         keys["algorithm.td3.actor_interval"] = 2
-    if case.algorithm == "sac":
+    if case.algorithm == "tqc":
+        keys["algorithm.tqc.critics"] = 2
+        keys["algorithm.tqc.quantiles"] = QUANTILES
+        keys["algorithm.tqc.dropped_quantiles"] = DROPPED
+    if case.algorithm in ("sac", "tqc"):
         keys["algorithm.sac.target_entropy_per_action"] = -1.0 if case.policy == "mlp" else -0.5
         keys["algorithm.sac.temperature_learning_rate"] = TEMPERATURE_LEARNING_RATE
     return {key: str(value) for key, value in keys.items()}
@@ -130,7 +137,8 @@ def draw_batches(case):
         "bootstrap": torch.where(torch.arange(rows) % 4 == 0, 0.0, 0.5 + 0.5 * uniform()),
         "next_observations": uniform(observation),
     }
-    noise = {"td3": ["target_noise"], "sac": ["next_noise", "noise"]}
+    both = ["next_noise", "noise"]
+    noise = {"td3": ["target_noise"], "sac": both, "tqc": both}
     for name in noise.get(case.algorithm, []):
         batches[name] = torch.randn(UPDATES, rows, case.steps, case.action_len)
     return batches
@@ -144,7 +152,7 @@ def draw_algorithm(case):
             if name.endswith("_target"):
                 for values in network.parameters():
                     values += 0.1 * torch.rand(values.shape) - 0.05
-        if case.algorithm == "sac":
+        if case.algorithm in ("sac", "tqc"):
             algorithm.log_temperature -= 0.5
     return algorithm
 
@@ -165,7 +173,8 @@ def run(algorithm, batches):
         algorithm.update({name: values[index] for name, values in batches.items()})
         count = index + 1
         if count in detailed:
-            out[f"update_{count}.targets"] = algorithm.targets.clone()
+            if algorithm.targets is not None:
+                out[f"update_{count}.targets"] = algorithm.targets.clone()
             for name, loss in algorithm.losses.items():
                 out[f"update_{count}.loss.{name}"] = loss.reshape(1)
             # An update that skips the actor leaves the gradient of another.

@@ -73,6 +73,7 @@ pages! {
     every_block_about_results_runs: "docs/results.md",
     every_block_about_benchmarks_runs: "docs/benchmarks.md",
     every_block_about_trained_policies_runs: "docs/zoo.md",
+    every_block_about_an_algorithm_of_ones_own_runs: "docs/own-algorithm.md",
 }
 
 /// A fenced block of code.
@@ -86,7 +87,10 @@ struct Block {
 
 impl Block {
     fn is_run(&self) -> bool {
-        !self.has("not-run") && !["text", "json", "math"].contains(&self.language.as_str())
+        // An included file is compiled with the project.
+        let is_included = self.text.trim_start().starts_with("{{#include ");
+        let is_read = is_included || ["text", "json", "math"].contains(&self.language.as_str());
+        !self.has("not-run") && !is_read
     }
 
     fn has(&self, attribute: &str) -> bool {

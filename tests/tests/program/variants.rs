@@ -55,6 +55,14 @@ fn neural_dynamic_policies_train() {
     trains("pusher", &ndp(&["--set", "policy.controller=inverse"]));
 }
 
+/// Updates as graphs: of an algorithm with kernels, and of one without.
+#[test]
+fn algorithms_train_as_graphs() {
+    trains("reacher", &["--backend", "graph"]);
+    trains("reacher", &["--algo", "tqc"]);
+    trains("panda-push", &["--algo", "tqc", "--policy", "mlp"]);
+}
+
 #[test]
 fn the_seven_joints_of_pusher_train() {
     trains("pusher", &[]);

@@ -106,7 +106,7 @@ impl Cycle {
                 let critics = networks.critics_step(2).repeat(updates as usize);
                 Self { products: [critics, networks.actor_step(1)].concat(), updates }
             }
-            AlgorithmName::Ndp => one_update(Vec::new()),
+            AlgorithmName::Tqc | AlgorithmName::Ndp => one_update(Vec::new()),
         }
     }
 }

@@ -89,6 +89,12 @@ pub(super) fn run(args: &LearnerArgs) -> anyhow::Result<Outcome> {
              ddpg, td3 or sac",
         ));
     }
+    if config.algorithm.name.is_graph_only() {
+        return Err(wrong_use(format!(
+            "--algo {}: it has no kernels to compare with a floor; expected ddpg, td3 or sac",
+            config.algorithm.name.name()
+        )));
+    }
     let mut peers = args.peer.clone();
     peers.sort();
     peers.dedup();

@@ -374,6 +374,18 @@ mod tests {
     }
 
     #[test]
+    fn tasks_with_objects_discount_more_than_the_preset_goal_but_the_user_decides() {
+        let discount = |task, set: &[String]| {
+            let sources = Sources { preset: "goal", set, ..sources(task) };
+            merge(&sources).unwrap().algorithm.discount
+        };
+        let own = ["algorithm.discount=0.9".to_owned()];
+        assert_eq!(discount("panda-push", &[]), 0.95);
+        assert_eq!(discount("panda-push", &own), 0.9);
+        assert_eq!(discount("panda-reach", &[]), 0.98);
+    }
+
+    #[test]
     fn set_needs_an_equals_sign() {
         let set = ["run.steps".to_owned()];
         let mut sources = sources("reacher");

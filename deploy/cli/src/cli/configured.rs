@@ -16,8 +16,11 @@ use super::demos::is_foreign;
 #[derive(Debug, Args)]
 pub(super) struct ConfiguredArgs {
     /// Learning algorithm.
-    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac", "ndp"]))]
+    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac", "tqc", "ndp"]))]
     algo: Option<String>,
+    /// What computes an update on the CPU [default: kernels, but graph with --algo tqc].
+    #[arg(long, value_parser = PossibleValuesParser::new(["kernels", "graph"]))]
+    backend: Option<String>,
     /// Policy type. dmp: one movement primitive per segment. mlp: one action at every step. chunk:
     /// the actions of a segment, without a primitive.
     #[arg(long, value_parser = PossibleValuesParser::new(["dmp", "mlp", "chunk"]))]
@@ -55,7 +58,7 @@ pub(super) struct ConfiguredArgs {
 impl ConfiguredArgs {
     /// Returns true if no argument was given.
     pub(super) fn is_empty(&self) -> bool {
-        let words = [&self.algo, &self.policy].into_iter().all(Option::is_none);
+        let words = [&self.algo, &self.backend, &self.policy].into_iter().all(Option::is_none);
         let counts = [self.workers, self.envs_per_worker].into_iter().all(|count| count.is_none());
         let pairs = self.env_kwargs.is_empty() && self.set.is_empty();
         let lists = self.python_path.is_empty() && pairs;
@@ -98,6 +101,7 @@ impl ConfiguredArgs {
         let python_path = found.map_or_else(|| self.python_path.clone(), |folder| vec![folder]);
         let flags = [
             flag("--algo", "algorithm.name", text(&self.algo)),
+            flag("--backend", "learner.backend", text(&self.backend)),
             flag("--policy", "policy.kind", text(&self.policy)),
             flag("--workers", "actors.workers", count(self.workers)),
             flag("--envs-per-worker", "actors.envs_per_worker", count(self.envs_per_worker)),

@@ -45,8 +45,8 @@ pub(super) struct RecordArgs {
     #[arg(long, value_name = "N", default_value_t = 1,
         value_parser = clap::value_parser!(u64).range(1..=EPISODES_MAX))]
     episodes: u64,
-    /// Show the episodes of this run, or zoo:TASK, next to them, with the same task and seeds. It uses the same choice
-    /// of --policy, or its best if --policy is a version.
+    /// Show the episodes of this run, or zoo:TASK, next to them, with the same task and seeds. It
+    /// uses the same choice of --policy, or its best if --policy is a version.
     #[arg(long, value_name = "RUN2")]
     compare: Option<PathBuf>,
     /// Output directory [default: videos in the run].

@@ -10,9 +10,7 @@ use clap::builder::PossibleValuesParser;
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::grouped;
 use dmprl_run::{Manifest, PolicyChoice, RunDirectory, Zoo, compact, safe_name};
-use dmprl_shared::config::{
-    AlgorithmName, ExperimentConfig, Limits, PolicyKind, TaskDefaults, task_defaults,
-};
+use dmprl_shared::config::{ExperimentConfig, Limits, PolicyKind, TaskDefaults, task_defaults};
 use dmprl_shared::dmp::Dmp;
 use dmprl_supervisor::Trial;
 use dmprl_supervisor::capacity;
@@ -255,13 +253,8 @@ fn is_safetensors(path: &Path) -> std::io::Result<bool> {
 }
 
 fn default_path(config: &ExperimentConfig) -> anyhow::Result<PathBuf> {
-    let algorithm = match config.algorithm.name {
-        AlgorithmName::Ddpg => "ddpg",
-        AlgorithmName::Td3 => "td3",
-        AlgorithmName::Sac => "sac",
-        AlgorithmName::Ndp => "ndp",
-    };
-    let (policy, seed) = (config.policy.kind.name(), config.run.seed);
+    let (algorithm, policy) = (config.algorithm.name.name(), config.policy.kind.name());
+    let seed = config.run.seed;
     let task = safe_name(&config.task.name);
     let name = format!("{task}-{algorithm}-{policy}-s{seed}-{}", compact(SystemTime::now()));
     let candidates = (1..=SAME_SECOND_MAX).map(|number| match number {

@@ -173,7 +173,7 @@ fn titles(sides: &[(&RunDirectory, ChosenPolicy)]) -> anyhow::Result<Vec<String>
     let mut methods = Vec::new();
     for (run, _) in sides {
         let config = run.config()?;
-        let algorithm = format!("{:?}", config.algorithm.name).to_lowercase();
+        let algorithm = config.algorithm.name.name();
         let policy = format!("{:?}", config.policy.kind).to_lowercase();
         let task = if config.task.name.is_empty() { &config.task.id } else { &config.task.name };
         methods.push(format!("{task} · {algorithm} · {policy}"));

@@ -1,0 +1,129 @@
+//! A network with its target and optimiser on the device.
+//!
+//! Optimiser and target handle the parameters as one vector. Gradients are computed for its parts,
+//! the variables. candle would pad the gradient of each part to the length of the vector.
+
+use candle_core::{Device, Result, Tensor, Var};
+use dmprl_shared::policy::MlpShape;
+
+use super::Of;
+use super::modules::Variable;
+use crate::update::kernels::{BETA1, BETA2, EPSILON};
+use crate::update::network::TrainableNetwork;
+
+/// A network.
+#[derive(Debug)]
+pub(super) struct DeviceNetwork {
+    pub(super) name: &'static str,
+    pub(super) shape: MlpShape,
+    /// Whether the network is built with candle-nn.
+    pub(super) is_module: bool,
+    /// Parts of the parameters, which follow each other.
+    pub(super) variables: Vec<Variable>,
+    /// Copies of the parts, which have gradients.
+    leaves: Vec<Var>,
+    /// All parameters, (P,).
+    pub(super) parameters: Tensor,
+    target: Option<Tensor>,
+    moments: [Tensor; 2],
+    step: u64,
+    learning_rate: f64,
+    /// Gradient of the last step.
+    gradient: Option<Tensor>,
+}
+
+impl DeviceNetwork {
+    /// Copies a network from the host. `variables` are those of candle-nn, if it is built with it.
+    pub(super) fn new(
+        name: &'static str,
+        network: &TrainableNetwork,
+        variables: Option<Vec<Variable>>,
+        device: &Device,
+    ) -> Result<Self> {
+        let to = |values: &[f32]| Tensor::from_slice(values, values.len(), device);
+        let moments = &network.adam.moments;
+        let is_module = variables.is_some();
+        let variables = variables
+            .unwrap_or_else(|| Variable::of_mlp(&network.shape, network.layer_norm.as_ref()));
+        let parameters = to(network.parameters.values())?;
+        let leaves = variables.iter().map(|part| Var::from_tensor(&part.view(&parameters)?));
+        let leaves = leaves.collect::<Result<_>>()?;
+        Ok(Self {
+            is_module,
+            variables,
+            leaves,
+            parameters,
+            name,
+            shape: network.shape.clone(),
+            target: network.target.as_ref().map(|target| to(target.values())).transpose()?,
+            moments: [to(&moments.first)?, to(&moments.second)?],
+            step: network.adam.step.0,
+            learning_rate: network.adam.learning_rate(),
+            gradient: None,
+        })
+    }
+
+    /// Copies parameters, target and optimiser back to the host.
+    pub(super) fn fetch(&self, network: &mut TrainableNetwork) -> Result<()> {
+        network.parameters.set(&self.parameters.to_vec1::<f32>()?)?;
+        if let (Some(own), Some(target)) = (&mut network.target, &self.target) {
+            own.set(&target.to_vec1::<f32>()?)?;
+        }
+        network.adam.moments.first = self.moments[0].to_vec1()?;
+        network.adam.moments.second = self.moments[1].to_vec1()?;
+        network.adam.step.0 = self.step;
+        if let Some(gradient) = &self.gradient {
+            network.set_gradient(&gradient.to_vec1::<f32>()?);
+        }
+        Ok(())
+    }
+
+    /// Returns the network's variables in order. Without a target network, `Of::Target` is
+    /// `Of::Frozen`.
+    pub(super) fn tensors(&self, of: Of) -> Result<Vec<Tensor>> {
+        let flat = match (of, &self.target) {
+            (Of::Network, _) => {
+                return Ok(self.leaves.iter().map(|leaf| leaf.as_tensor().clone()).collect());
+            }
+            (Of::Target, Some(target)) => target,
+            (Of::Target, None) | (Of::Frozen, _) => &self.parameters,
+        };
+        self.variables.iter().map(|part| part.view(flat)).collect()
+    }
+
+    /// Returns the gradient of `loss`, (P,).
+    pub(super) fn gradient_of(&self, loss: &Tensor) -> Result<Tensor> {
+        let gradients = loss.backward()?;
+        if self.leaves.iter().all(|leaf| gradients.get(leaf).is_none()) {
+            candle_core::bail!("the loss does not depend on {}", self.name);
+        }
+        let parts = self.leaves.iter().map(|leaf| match gradients.get(leaf) {
+            Some(gradient) => gradient.flatten_all(),
+            None => leaf.zeros_like()?.flatten_all(),
+        });
+        Ok(Tensor::cat(&parts.collect::<Result<Vec<_>>>()?, 0)?.detach())
+    }
+
+    /// Does one step of Adam. With `polyak`, it also moves the target, if there is one.
+    pub(super) fn step(&mut self, gradient: Tensor, polyak: Option<f64>) -> Result<()> {
+        self.step += 1;
+        let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.step as f64);
+        let [first, second] = &self.moments;
+        let (beta1, beta2) = (f64::from(BETA1), f64::from(BETA2));
+        let first = ((first * beta1)? + (&gradient * (1.0 - beta1))?)?;
+        let second = ((second * beta2)? + (gradient.sqr()? * (1.0 - beta2))?)?;
+        let root = (second.sqrt()? / correction(BETA2).sqrt())?;
+        let change = (&first / (root + f64::from(EPSILON))?)?;
+        let change = (change * (self.learning_rate / correction(BETA1)))?;
+        self.parameters = (&self.parameters - change)?;
+        for (leaf, part) in self.leaves.iter().zip(&self.variables) {
+            leaf.set(&part.view(&self.parameters)?)?;
+        }
+        if let (Some(target), Some(polyak)) = (&mut self.target, polyak) {
+            *target = (&*target + ((&self.parameters - &*target)? * polyak)?)?;
+        }
+        self.moments = [first, second];
+        self.gradient = Some(gradient);
+        Ok(())
+    }
+}
