@@ -378,7 +378,7 @@ def _plan(file: PolicyFile) -> dict[str, Any]:
     inputs = spec["observation_len"] + carried
     if widths[0] != inputs:
         raise ValueError(f"actor.0.weight has {widths[0]} inputs, expected {inputs}")
-    # SAC's network outputs the log-stds after the decisions.
+    # The network of SAC and TQC outputs the log-stds after the decisions.
     log_stds_len = steps * spec["action_len"] if description["algorithm"] in ("sac", "tqc") else 0
     controlled = 4 if policy["controller"] == "inverse" else 0
     decided = 1 + description["dmp"]["basis_count"] + controlled if is_dmp else steps

@@ -118,6 +118,7 @@ fn a_network_that_decides_every_step_acts_the_same() {
 fn the_mean_of_a_squashed_gaussian_acts_the_same() {
     assert_same("reacher", &[("algorithm.name", "sac"), ("policy.kind", "mlp")]);
     assert_same("pusher", &[("algorithm.name", "sac")]);
+    assert_same("reacher", &[("algorithm.name", "tqc")]);
 }
 
 #[test]

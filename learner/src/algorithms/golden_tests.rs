@@ -27,8 +27,7 @@ fn files() -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder()).unwrap().map(|entry| entry.unwrap().path());
     let learns_from_batches = |path: &PathBuf| {
         let name = path.file_name().unwrap().to_str().unwrap();
-        let kinds = ["ddpg_", "td3_", "sac_", "tqc_"];
-        kinds.iter().any(|kind| name.starts_with(kind)) && name.ends_with(".safetensors")
+        name.ends_with(".safetensors") && !name.starts_with("ndp")
     };
     let mut files: Vec<_> = entries.filter(learns_from_batches).collect();
     files.sort();

@@ -87,8 +87,10 @@ impl Algorithm {
             AlgorithmName::Ddpg => Kind::Ddpg(Box::new(Ddpg::new(config, policy, shape)?)),
             AlgorithmName::Td3 => Kind::Td3(Box::new(Td3::new(config, policy, shape)?)),
             AlgorithmName::Sac => Kind::Sac(Box::new(Sac::new(config, policy, shape)?)),
-            AlgorithmName::Tqc => Kind::Graph(graph::new_networks(config, policy, shape)?),
-            AlgorithmName::Ndp => candle_core::bail!("ndp does not learn from a replay"),
+            name if name.is_graph_only() => {
+                Kind::Graph(graph::new_networks(config, policy, shape)?)
+            }
+            name => candle_core::bail!("{} does not learn from a replay", name.name()),
         };
         let device = match config.learner.device {
             config::Device::Cpu => Device::Cpu,

@@ -100,6 +100,8 @@ fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
         &[][..],
         &[("algorithm.name", "td3"), ("policy.normalise_observations", "true")],
         &[("algorithm.name", "sac"), ("policy.normalise_observations", "true")],
+        &[("algorithm.name", "tqc"), ("policy.normalise_observations", "true")],
+        &[("learner.backend", "graph"), ("policy.normalise_observations", "true")],
         &[("algorithm.critic_layer_norm", "true"), ("policy.normalise_observations", "true")],
         &[("demonstrations.files", "['some.npz']"), ("policy.normalise_observations", "true")],
     ] {

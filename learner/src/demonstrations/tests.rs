@@ -230,6 +230,7 @@ fn a_cloned_policy_does_what_was_demonstrated() {
         &[("policy.kind", "mlp")],
         &[("policy.kind", "chunk")],
         &[("algorithm.name", "sac"), ("policy.normalise_observations", "true")],
+        &[("algorithm.name", "tqc"), ("algorithm.critic_layer_norm", "true")],
         &[("algorithm.critic", "first"), ("algorithm.windows", "segment")],
     ] {
         let updates = [("demonstrations.cloning_updates", "400")];

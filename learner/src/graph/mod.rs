@@ -2,8 +2,8 @@
 //!
 //! A [`GraphAlgorithm`] is one file of this folder: its networks, its losses, and its differences
 //! from the paper. [`tqc`] exists only here and is the example of the book ("An algorithm of your
-//! own"). DDPG, TD3 and SAC also have kernels (`update`), which do the same several times faster on
-//! the CPU. Tests in `algorithms` compare the losses, gradients and parameters of both. Unlike the
+//! own"). DDPG, TD3 and SAC also have kernels (`update`), which do the same twice as fast on the
+//! CPU. Tests in `algorithms` compare the losses, gradients and parameters of both. Unlike the
 //! kernels, candle's operations allocate their outputs.
 
 mod batch;

@@ -59,8 +59,8 @@ impl Variable {
     }
 }
 
-/// Draws a network on the host: asks `build` for its variables, and draws each from the random
-/// stream `name`.
+/// Draws a critic with its target on the host: asks `build` for its variables, and draws each from
+/// the random stream `name`. Its inputs begin with the observation.
 ///
 /// # Errors
 /// If the network cannot be built, or its first layer is not a linear one. When the normalisation
@@ -71,7 +71,8 @@ pub(super) fn draw(
     inputs: usize,
     build: impl Fn(VarBuilder<'_>) -> Result<Box<dyn Module>>,
 ) -> Result<TrainableNetwork> {
-    let (_, Recorded { variables, values, .. }) = record(config.run.seed, name, build)?;
+    let random = seeds::stream(config.run.seed, name, 0);
+    let (_, Recorded { variables, values, .. }) = record(Some(random), build)?;
     let first = variables.first().map(|first| first.shape.dims().to_vec()).unwrap_or_default();
     let second = variables.get(1).map(|second| second.shape.dims().to_vec()).unwrap_or_default();
     let outputs = match *first {
@@ -94,7 +95,7 @@ pub(super) fn draw(
 pub(super) fn variables(
     build: impl Fn(VarBuilder<'_>) -> Result<Option<Box<dyn Module>>>,
 ) -> Result<Option<Vec<Variable>>> {
-    let (module, recorded) = record(0, "", build)?;
+    let (module, recorded) = record(None, build)?;
     Ok(module.map(|_| recorded.variables))
 }
 
@@ -130,19 +131,18 @@ pub(super) fn layer_norm(len: usize, builder: &VarBuilder<'_>) -> Result<impl Mo
     Ok(move |x: &Tensor| normalise(x, &gain, &shift))
 }
 
+/// Asks `build` for its variables. Without random numbers they are zero.
 fn record<T>(
-    seed: u64,
-    name: &str,
+    random: Option<Stream>,
     build: impl Fn(VarBuilder<'_>) -> Result<T>,
 ) -> Result<(T, Recorded)> {
-    let random = seeds::stream(seed, name, 0);
     let recorded = Recorded { random, variables: Vec::new(), values: Vec::new() };
     let recorder = Recorder(Arc::new(Mutex::new(Some(recorded))));
     let shared = Arc::clone(&recorder.0);
     let built = build(VarBuilder::from_backend(Box::new(recorder), DType::F32, Device::Cpu))?;
     match shared.lock().take() {
         Some(recorded) => Ok((built, recorded)),
-        None => candle_core::bail!("{name} was recorded twice"),
+        None => candle_core::bail!("a network was recorded twice"),
     }
 }
 
@@ -150,7 +150,7 @@ fn record<T>(
 struct Recorder(Arc<Mutex<Option<Recorded>>>);
 
 struct Recorded {
-    random: Stream,
+    random: Option<Stream>,
     variables: Vec<Variable>,
     values: Vec<f32>,
 }
@@ -172,7 +172,13 @@ impl SimpleBackend for Recorder {
             candle_core::bail!("a network has two variables named {name}");
         }
         let start = values.len();
-        values.extend((0..shape.elem_count()).map(|_| init_value(init, &shape, random) as f32));
+        let count = shape.elem_count();
+        match random {
+            Some(random) => {
+                values.extend((0..count).map(|_| init_value(init, &shape, random) as f32));
+            }
+            None => values.resize(start + count, 0.0),
+        }
         let tensor = Tensor::from_slice(&values[start..], shape.clone(), device)?;
         let range = start..values.len();
         variables.push(Variable { name: name.to_owned(), shape, range });
@@ -208,6 +214,8 @@ fn init_value(init: Init, shape: &Shape, random: &mut Stream) -> f64 {
 mod tests {
     use candle_nn::seq;
 
+    use super::super::Of;
+    use super::super::network::DeviceNetwork;
     use super::*;
 
     fn two_layers(builder: &VarBuilder<'_>) -> Result<Box<dyn Module>> {
@@ -243,6 +251,24 @@ mod tests {
         let output = network.forward(&inputs).unwrap().to_vec2::<f32>().unwrap();
         // 9 (1 - 3 + 7) + 10 (4 - 6 + 8) + 11.
         assert_eq!(output, [[116.0]]);
+    }
+
+    #[test]
+    fn a_loss_without_a_gradient_names_the_network_and_the_remedy() {
+        let build = |builder: VarBuilder<'_>| -> Result<Box<dyn Module>> {
+            let first = linear(3, 2, &builder.pp("first"))?;
+            let norm = candle_nn::layer_norm(2, 1e-5, builder.pp("norm"))?;
+            Ok(Box::new(seq().add(first).add(norm)))
+        };
+        let host = draw(&ExperimentConfig::default(), "critic_1", 3, build).unwrap();
+        let variables = variables(|builder| build(builder).map(Some)).unwrap();
+        let network = DeviceNetwork::new("critic_1", &host, variables, &Device::Cpu).unwrap();
+        let tensors = network.tensors(Of::Network).unwrap();
+        let module = build(builder(&network.variables, tensors, &Device::Cpu)).unwrap();
+        let inputs = Tensor::new(&[[1.0_f32, 0.0, -1.0]], &Device::Cpu).unwrap();
+        let loss = module.forward(&inputs).unwrap().sum_all().unwrap();
+        let error = network.gradient_of(&loss).unwrap_err().to_string();
+        assert!(error.contains("critic_1") && error.contains("modules::layer_norm"), "{error}");
     }
 
     #[test]

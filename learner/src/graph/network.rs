@@ -92,14 +92,18 @@ impl DeviceNetwork {
     }
 
     /// Returns the gradient of `loss`, (P,).
+    ///
+    /// # Errors
+    /// If a variable has no gradient, or a device operation fails.
     pub(super) fn gradient_of(&self, loss: &Tensor) -> Result<Tensor> {
         let gradients = loss.backward()?;
-        if self.leaves.iter().all(|leaf| gradients.get(leaf).is_none()) {
-            candle_core::bail!("the loss does not depend on {}", self.name);
-        }
-        let parts = self.leaves.iter().map(|leaf| match gradients.get(leaf) {
+        let parts = self.leaves.iter().enumerate().map(|(index, leaf)| match gradients.get(leaf) {
             Some(gradient) => gradient.flatten_all(),
-            None => leaf.zeros_like()?.flatten_all(),
+            None => candle_core::bail!(
+                "{}: the loss has no gradient for variable {index}; use only operations that have \
+                 one (modules::layer_norm, not candle_nn's)",
+                self.name
+            ),
         });
         Ok(Tensor::cat(&parts.collect::<Result<Vec<_>>>()?, 0)?.detach())
     }

@@ -20,6 +20,9 @@ pub enum AlgorithmName {
 }
 
 impl AlgorithmName {
+    /// All algorithms.
+    pub const ALL: [Self; 5] = [Self::Ddpg, Self::Td3, Self::Sac, Self::Tqc, Self::Ndp];
+
     /// Returns the name in configuration files and of run directories.
     #[must_use]
     pub fn name(self) -> &'static str {
@@ -156,7 +159,7 @@ impl Default for Td3Config {
     }
 }
 
-/// Settings of SAC.
+/// Settings of SAC, and of TQC's temperature.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SacConfig {

@@ -15,8 +15,8 @@ use crate::spec::EnvSpec;
 pub struct PolicyDescription {
     /// The environment's sizes, bounds and timing.
     pub spec: EnvSpec,
-    /// Algorithm that trained the policy. With SAC the network also outputs log-stds; with NDP the
-    /// policy has learned standard deviations.
+    /// Algorithm that trained the policy. With SAC and TQC the network also outputs log-stds; with
+    /// NDP the policy has learned standard deviations.
     pub algorithm: AlgorithmName,
     /// Kind, network, ranges, controller and start.
     pub policy: PolicyConfig,

@@ -175,8 +175,7 @@ fn others() -> Vec<(String, Table)> {
             others.push((format!("with `--policy {}`", name_of(kind)), table));
         }
     }
-    let all = [AlgorithmName::Ddpg, AlgorithmName::Td3, AlgorithmName::Sac, AlgorithmName::Ndp];
-    for algorithm in all {
+    for algorithm in AlgorithmName::ALL {
         if let Some(table) = algorithm_defaults(algorithm) {
             others.push((format!("with `--algo {}`", name_of(algorithm)), table));
         }

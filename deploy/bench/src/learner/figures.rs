@@ -161,6 +161,7 @@ impl Figures {
             "samples_per_s": updates_per_s.map(|rate| rate * batch_size as f64),
             "batch_size": batch_size,
             "threads": self.config.learner.threads,
+            "backend": if self.config.updates_by_graph() { "graph" } else { "kernels" },
             "algorithm": self.config.algorithm.name,
             "policy": self.config.policy.kind,
             "task": self.config.task.name,

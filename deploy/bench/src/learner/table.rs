@@ -13,12 +13,13 @@ impl Figures {
         let (algorithm, threads) = (&self.config.algorithm, self.config.learner.threads);
         let mut lines = vec![
             format!(
-                "{} · {:?} · {:?} · batch {} · {threads} thread{}",
+                "{} · {:?} · {:?} · batch {} · {threads} thread{}{}",
                 self.config.task.name,
                 algorithm.name,
                 self.config.policy.kind,
                 algorithm.batch_size,
-                if threads == 1 { "" } else { "s" }
+                if threads == 1 { "" } else { "s" },
+                if self.config.updates_by_graph() { " · graph" } else { "" }
             )
             .to_lowercase(),
             format!("median of {} rounds of {} s", self.rounds_len(), self.seconds),

@@ -103,7 +103,7 @@ pub(super) fn run(args: &ScaleArgs) -> anyhow::Result<Outcome> {
     if config.algorithm.name == AlgorithmName::Ndp {
         return Err(wrong_use(
             "--algo ndp: it learns from whole rollouts, not from batches of a replay; expected \
-             ddpg, td3 or sac",
+             ddpg, td3, sac or tqc",
         ));
     }
     if config.run.deterministic {

@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, RangedI64ValueParser};
 use dmprl_run::failure::wrong_use;
-use dmprl_shared::config::{Device, ExperimentConfig, PRESETS, suitable_preset};
+use dmprl_shared::config::{AlgorithmName, Device, ExperimentConfig, PRESETS, suitable_preset};
 use toml::Value;
 
 use super::configuration::{Flag, Sources};
@@ -16,7 +16,8 @@ use super::demos::is_foreign;
 #[derive(Debug, Args)]
 pub(super) struct ConfiguredArgs {
     /// Learning algorithm.
-    #[arg(long, value_parser = PossibleValuesParser::new(["ddpg", "td3", "sac", "tqc", "ndp"]))]
+    #[arg(long,
+          value_parser = PossibleValuesParser::new(AlgorithmName::ALL.map(AlgorithmName::name)))]
     algo: Option<String>,
     /// What computes an update on the CPU [default: kernels, but graph with --algo tqc].
     #[arg(long, value_parser = PossibleValuesParser::new(["kernels", "graph"]))]

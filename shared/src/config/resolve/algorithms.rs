@@ -7,7 +7,7 @@ use crate::config::{
 };
 
 const CRITICS_MAX: usize = 10;
-const QUANTILES_MAX: usize = 1_000;
+const QUANTILES_MAX: usize = 200;
 
 impl ExperimentConfig {
     pub(super) fn check_ndp(&self) -> Result<(), ConfigError> {
