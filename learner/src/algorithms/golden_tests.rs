@@ -122,6 +122,7 @@ impl Golden {
         config.learner.backend = backend;
         let policy = Policy::new(&config, &spec()).unwrap();
         let mut algorithm = Algorithm::new(&config, &policy, None).unwrap();
+        assert_eq!(algorithm.replica.is_some(), config.updates_by_graph());
         let shape = algorithm.batch_shape();
         let mut batch = Batch::new(shape);
         self.start(&mut algorithm);

@@ -32,17 +32,20 @@ use policy::{DeviceStates, Means, PolicyGraph, mlp};
 
 /// An algorithm as losses on the graph. All its state is in its networks.
 trait GraphAlgorithm: Debug + Send + Sync {
-    /// Makes the networks with newly drawn parameters, the actor first, if there are no kernels
-    /// that have them.
+    /// Makes the networks with newly drawn parameters, the actor first. An algorithm with kernels
+    /// uses theirs.
     ///
     /// # Errors
     /// If the configuration does not fit.
     fn networks(&self, context: &Context<'_>, _: &Policy) -> Result<NamedNetworks> {
-        candle_core::bail!("{:?} uses the networks of the kernels", context.config.algorithm.name)
+        candle_core::bail!(
+            "{} uses the networks of its kernels",
+            context.config.algorithm.name.name()
+        )
     }
 
-    /// Builds the network `name` with candle-nn on the variables of `builder`, unless it is a plain
-    /// multilayer perceptron of the kernels.
+    /// Builds the network `name` with candle-nn on the variables of `builder`. Returns `None` for a
+    /// multilayer perceptron as the kernels have it.
     ///
     /// # Errors
     /// If the builder has no such variables.
@@ -65,7 +68,7 @@ trait GraphAlgorithm: Debug + Send + Sync {
 /// Networks with their names in a checkpoint.
 pub(crate) type NamedNetworks = Vec<(&'static str, TrainableNetwork)>;
 
-/// What networks are made for.
+/// Configuration and sizes, on which networks depend.
 #[derive(Debug, Clone)]
 struct Context<'a> {
     config: &'a ExperimentConfig,

@@ -13,6 +13,7 @@
 
 use candle_core::{D, Module, Result, Tensor};
 use candle_nn::{VarBuilder, seq};
+use dmprl_shared::config::TqcConfig;
 use dmprl_shared::policy::Policy;
 
 use super::batch::DeviceBatch;
@@ -22,7 +23,7 @@ use crate::algorithms::{new_actor, new_outcome_model};
 use crate::update::network::TrainableNetwork;
 
 /// Names of the critics in a checkpoint.
-const CRITICS: [&str; 10] = [
+const CRITICS: [&str; TqcConfig::CRITICS_MAX] = [
     "critic_1",
     "critic_2",
     "critic_3",
@@ -66,17 +67,14 @@ impl GraphAlgorithm for Tqc {
     fn update(&self, graph: &mut Graph, batch: &DeviceBatch, _: u64) -> Result<Losses> {
         let tqc = graph.config.algorithm.tqc.clone();
         let critics = &CRITICS[..tqc.critics];
-        let temperature = graph.temperature()?;
 
-        let next = graph.means(Of::Target, &batch.next_states)?;
-        let (u, density) = next.draw(&batch.next_noise)?;
-        let inputs = graph.critic_inputs(&batch.next_states, &next.with_end_state(&u)?)?;
-        let (all, _) = graph.quantiles(critics, Of::Target, &inputs)?.sort_last_dim(true)?;
-        let kept = all.narrow(1, 0, tqc.critics * (tqc.quantiles - tqc.dropped_quantiles))?;
-        let bonus = density.broadcast_mul(&temperature)?;
-        let targets = batch.targets(&kept.broadcast_sub(&bonus)?)?;
-        let mut losses =
-            Losses { temperature: Some(temperature.to_vec1()?[0]), ..Losses::default() };
+        let next = graph.next_draw(batch)?;
+        let all = graph.quantiles(critics, Of::Target, &next.critic_inputs)?;
+        let (sorted, _) = all.sort_last_dim(true)?;
+        let kept = sorted.narrow(1, 0, tqc.critics * (tqc.quantiles - tqc.dropped_quantiles))?;
+        let targets = batch.targets(&kept.broadcast_sub(&next.entropy_cost)?)?;
+
+        let mut losses = Losses::default();
         let mut q_size = 0.0;
         for (index, name) in critics.iter().enumerate() {
             let quantiles = graph.forward(name, Of::Network, &batch.critic_inputs)?;
@@ -90,15 +88,9 @@ impl GraphAlgorithm for Tqc {
             graph.descend(name, &loss, true)?;
         }
 
-        let means = graph.means(Of::Network, &batch.states)?;
-        let (u, density) = means.draw(&batch.noise)?;
-        let inputs = graph.critic_inputs(&batch.states, &means.with_end_state(&u)?)?;
-        let q = graph.quantiles(critics, Of::Frozen, &inputs)?.mean_keepdim(1)?;
-        let penalty = graph.action_rate_penalty(&means.means.tanh()?, batch, q_size)?;
-        let loss = ((density.broadcast_mul(&temperature)? - q)?.mean_all()? + penalty)?;
-        graph.descend("actor", &loss, false)?;
-        losses.actor_loss = Some(loss.to_scalar()?);
-        losses.entropy = Some(graph.temperature_step(&density)?);
+        graph.soft_actor_step(batch, q_size, &mut losses, |graph, inputs| {
+            graph.quantiles(critics, Of::Frozen, inputs)?.mean_keepdim(1)
+        })?;
         Ok(losses)
     }
     // ANCHOR_END: update

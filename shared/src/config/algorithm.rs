@@ -118,9 +118,9 @@ pub struct AlgorithmConfig {
     /// sparse. Afterwards it is the reward of a step that ends away in a coordinate of the goals
     /// that is unreached, such as the height (docs/algorithm.md).
     pub motion_bonus: f64,
-    /// Whether the critics also see how far from the desired goal a model
-    /// expects the achieved goal after each step of the segment. The model learns from the same
-    /// batches. It needs an environment with a sparse goal rule and `critic = "segment"`.
+    /// Whether the critics also see how far from the desired goal a model expects the achieved goal
+    /// after each step of the segment. The model learns from the same batches. It needs an
+    /// environment with a sparse goal rule and `critic = "segment"`.
     pub outcome_model: bool,
     /// Settings of TD3.
     pub td3: Td3Config,
@@ -192,6 +192,11 @@ pub struct TqcConfig {
     pub quantiles: usize,
     /// Largest quantiles that are left out of the target, for each critic.
     pub dropped_quantiles: usize,
+}
+
+impl TqcConfig {
+    /// Maximum number of critics.
+    pub const CRITICS_MAX: usize = 10;
 }
 
 impl Default for TqcConfig {

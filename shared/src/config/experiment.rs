@@ -53,12 +53,19 @@ impl ExperimentConfig {
         self.actors.places().saturating_add(self.bridge.places())
     }
 
+    /// Returns true if there are kernels for the device and the algorithm.
+    pub(super) fn has_kernels(&self) -> bool {
+        self.learner.device == Device::Cpu && !self.algorithm.name.is_graph_only()
+    }
+
     /// Returns true if updates are graphs, not kernels.
     #[must_use]
     pub fn updates_by_graph(&self) -> bool {
-        let configured = self.learner.backend == Backend::Graph;
-        let on_cpu = self.learner.device == Device::Cpu;
-        configured || !on_cpu || self.algorithm.name.is_graph_only()
+        match self.learner.backend {
+            Backend::Graph => true,
+            Backend::Kernels => false,
+            Backend::Auto => !self.has_kernels(),
+        }
     }
 }
 
@@ -359,10 +366,12 @@ pub enum Device {
     Cuda,
 }
 
-/// What computes an update on the CPU.
+/// What computes an update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Backend {
+    /// Kernels, or a graph where there are none: on another device, and with `tqc`.
+    Auto,
     /// Our own kernels with gradients derived by hand, the fastest.
     Kernels,
     /// Losses on candle's graph with automatic differentiation: for new algorithms, and to check
@@ -387,8 +396,7 @@ pub enum Precision {
 pub struct LearnerConfig {
     /// Device that computes the updates.
     pub device: Device,
-    /// What computes an update on the CPU. On another device it is always the graph, and `tqc` has
-    /// nothing else.
+    /// What computes an update.
     pub backend: Backend,
     /// Threads that compute an update by kernels. Results are bit-identical for every number of
     /// threads. A graph on the CPU uses one, unless the environment variable `RAYON_NUM_THREADS`
@@ -404,7 +412,7 @@ impl Default for LearnerConfig {
     fn default() -> Self {
         Self {
             device: Device::Cpu,
-            backend: Backend::Kernels,
+            backend: Backend::Auto,
             threads: 1,
             precision: Precision::F32,
             publish_every_updates: 4,

@@ -76,7 +76,7 @@ impl ExperimentConfig {
         self.check_combinations()?;
         self.check_ndp()?;
         self.check_tqc()?;
-        self.check_precision()?;
+        self.check_backend()?;
         self.check_delivery()?;
         self.check_bridge()?;
         Ok(self)
@@ -393,6 +393,19 @@ mod tests {
         assert!(error(("exploration.warm_up_steps", "1")).contains("its own policy"));
         assert!(error(("algorithm.action_rate_penalty", "0.1")).contains("the other algorithms"));
         assert!(error(("policy.start", "observed")).contains("start_sources"));
+    }
+
+    #[test]
+    fn updates_are_graphs_where_there_are_no_kernels_and_on_request() {
+        let by_graph = |keys: &[_]| resolved(keys).map(|config| config.updates_by_graph());
+        let (td3, tqc) = (("algorithm.name", "td3"), ("algorithm.name", "tqc"));
+        let (kernels, graph) = (("learner.backend", "kernels"), ("learner.backend", "graph"));
+        assert!(!by_graph(&[td3]).unwrap() && !by_graph(&[td3, kernels]).unwrap());
+        assert!(by_graph(&[td3, graph]).unwrap() && by_graph(&[tqc]).unwrap());
+        let error = by_graph(&[tqc, kernels]).unwrap_err().to_string();
+        assert!(error.contains("learner.backend") && error.contains("auto or graph"), "{error}");
+        let error = by_graph(&[tqc, ("learner.precision", "bf16")]).unwrap_err().to_string();
+        assert!(error.contains("learner.precision"), "{error}");
     }
 
     #[test]

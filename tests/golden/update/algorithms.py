@@ -73,10 +73,15 @@ class ActorCritic:
     def critic_step(self, batch, q_next):
         """target = reward + bootstrap * q_next; descends the sum of the critics' errors."""
         self.targets = batch["rewards"] + batch["bootstrap"] * q_next
-        loss = sum(
-            squared_error(critic(batch["critic_inputs"])[:, 0], self.targets)
-            for critic in self.critics
+        self.descend_critics(
+            sum(
+                squared_error(critic(batch["critic_inputs"])[:, 0], self.targets)
+                for critic in self.critics
+            )
         )
+
+    def descend_critics(self, loss):
+        """One step of all critics."""
         self.critic_adam.zero_grad()
         loss.backward()
         self.critic_adam.step()
@@ -178,16 +183,24 @@ class Sac(ActorCritic):
         self.updates += 1
         temperature = self.log_temperature.detach().exp()
         with torch.no_grad():
-            following = batch["next_observations"]
-            actions, end, log_pi = self.draw(following, batch["next_noise"])
-            q_next = torch.minimum(*self.q(self.critic_targets, following, actions, end))
-            q_next = q_next - temperature * log_pi
-        self.critic_step(batch, q_next)
+            actions, end, log_pi = self.draw(batch["next_observations"], batch["next_noise"])
+        self.fit_critics(batch, actions, end, temperature * log_pi)
         actions, end, log_pi = self.draw(batch["observations"], batch["noise"])
-        q = torch.minimum(*self.q(self.critics, batch["observations"], actions, end))
+        q = self.value(batch["observations"], actions, end)
         self.actor_step((temperature * log_pi - q).mean())
         self.temperature_step(log_pi.detach())
         self.follow_critics()
+
+    def fit_critics(self, batch, actions, end, cost):
+        """Fits the critics to the values of the next actions, less the entropy's cost, (B,)."""
+        with torch.no_grad():
+            q = self.q(self.critic_targets, batch["next_observations"], actions, end)
+            q_next = torch.minimum(*q) - cost
+        self.critic_step(batch, q_next)
+
+    def value(self, observations, actions, end):
+        """The actor's objective, (B,)."""
+        return torch.minimum(*self.q(self.critics, observations, actions, end))
 
     def temperature_step(self, log_pi):
         """Descends -log temperature * mean(log pi + target entropy)."""
@@ -215,29 +228,21 @@ class Tqc(Sac):
         inputs = torch.cat([observations, seen], dim=1)
         return torch.cat([critic(inputs) for critic in critics], dim=1)
 
-    def update(self, batch):
-        """Critics, actor, temperature, targets of the critics."""
-        self.updates += 1
-        temperature = self.log_temperature.detach().exp()
+    def fit_critics(self, batch, actions, end, cost):
+        """Fits every quantile to the targets that are left after the largest are dropped."""
         with torch.no_grad():
             following = batch["next_observations"]
-            actions, end, log_pi = self.draw(following, batch["next_noise"])
             atoms = self.quantiles(self.critic_targets, following, actions, end)
             atoms = atoms.sort(dim=1).values[:, : len(self.critics) * (QUANTILES - DROPPED)]
-            atoms = atoms - temperature * log_pi[:, None]
+            atoms = atoms - cost[:, None]
             targets = batch["rewards"][:, None] + batch["bootstrap"][:, None] * atoms
-        loss = sum(
-            quantile_huber(critic(batch["critic_inputs"]), targets) for critic in self.critics
+        self.descend_critics(
+            sum(quantile_huber(critic(batch["critic_inputs"]), targets) for critic in self.critics)
         )
-        self.critic_adam.zero_grad()
-        loss.backward()
-        self.critic_adam.step()
-        self.losses = {"critic": loss.detach()}
-        actions, end, log_pi = self.draw(batch["observations"], batch["noise"])
-        q = self.quantiles(self.critics, batch["observations"], actions, end).mean(dim=1)
-        self.actor_step((temperature * log_pi - q).mean())
-        self.temperature_step(log_pi.detach())
-        self.follow_critics()
+
+    def value(self, observations, actions, end):
+        """The mean of all quantiles, (B,)."""
+        return self.quantiles(self.critics, observations, actions, end).mean(dim=1)
 
 
 def quantile_huber(quantiles, targets):

@@ -19,8 +19,8 @@ pub(super) struct ConfiguredArgs {
     #[arg(long,
           value_parser = PossibleValuesParser::new(AlgorithmName::ALL.map(AlgorithmName::name)))]
     algo: Option<String>,
-    /// What computes an update on the CPU [default: kernels, but graph with --algo tqc].
-    #[arg(long, value_parser = PossibleValuesParser::new(["kernels", "graph"]))]
+    /// What computes an update. auto: kernels where there are any, else a graph.
+    #[arg(long, value_parser = PossibleValuesParser::new(["auto", "kernels", "graph"]))]
     backend: Option<String>,
     /// Policy type. dmp: one movement primitive per segment. mlp: one action at every step. chunk:
     /// the actions of a segment, without a primitive.

@@ -3,10 +3,9 @@
 use super::range;
 use crate::config::{
     AlgorithmName, Backend, ConfigError, Controller, Device, ExperimentConfig, Hindsight,
-    PolicyKind, Precision,
+    PolicyKind, Precision, TqcConfig,
 };
 
-const CRITICS_MAX: usize = 10;
 const QUANTILES_MAX: usize = 200;
 
 impl ExperimentConfig {
@@ -51,8 +50,8 @@ impl ExperimentConfig {
         range("learner.device", "cuda", !on_policy || on_cpu, || {
             "cpu with algorithm.name = \"ndp\", whose minibatches are too small for a GPU".into()
         })?;
-        let kernels = self.learner.backend == Backend::Kernels;
-        range("learner.backend", "graph", !on_policy || kernels, || {
+        let graph = self.learner.backend == Backend::Graph;
+        range("learner.backend", "graph", !on_policy || !graph, || {
             "kernels with algorithm.name = \"ndp\", which has no graph".into()
         })?;
         let relabels = self.replay.hindsight != Hindsight::None;
@@ -82,7 +81,7 @@ impl ExperimentConfig {
     pub(super) fn check_tqc(&self) -> Result<(), ConfigError> {
         let tqc = &self.algorithm.tqc;
         let counts = [
-            ("algorithm.tqc.critics", tqc.critics, CRITICS_MAX),
+            ("algorithm.tqc.critics", tqc.critics, TqcConfig::CRITICS_MAX),
             ("algorithm.tqc.quantiles", tqc.quantiles, QUANTILES_MAX),
         ];
         for (key, got, high) in counts {
@@ -95,11 +94,15 @@ impl ExperimentConfig {
     }
 
     /// Only the kernels have 16-bit products.
-    pub(super) fn check_precision(&self) -> Result<(), ConfigError> {
+    pub(super) fn check_backend(&self) -> Result<(), ConfigError> {
+        let kernels = self.learner.backend == Backend::Kernels;
+        range("learner.backend", "kernels", !kernels || self.has_kernels(), || {
+            "auto or graph: there are kernels only for ddpg, td3, sac and ndp on the CPU".into()
+        })?;
         let bf16 = self.learner.precision == Precision::Bf16;
         range("learner.precision", "bf16", !bf16 || !self.updates_by_graph(), || {
             "f32 where updates are graphs (learner.backend = \"graph\", learner.device = \"cuda\", \
-             and algorithm.name = \"tqc\")"
+             or algorithm.name = \"tqc\")"
                 .into()
         })
     }
