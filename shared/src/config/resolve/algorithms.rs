@@ -52,7 +52,7 @@ impl ExperimentConfig {
         })?;
         let graph = self.learner.backend == Backend::Graph;
         range("learner.backend", "graph", !on_policy || !graph, || {
-            "kernels with algorithm.name = \"ndp\", which has no graph".into()
+            "auto or kernels with algorithm.name = \"ndp\", which has no graph".into()
         })?;
         let relabels = self.replay.hindsight != Hindsight::None;
         range("replay.hindsight", "future", !on_policy || !relabels, || {
