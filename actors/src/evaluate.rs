@@ -225,7 +225,7 @@ impl Evaluator {
         let all = vec![true; self.envs];
         self.environments.reset(&all, &wave.seeds)?;
         self.faults.inspect_reset(&mut self.environments, &all)?;
-        (0..self.envs).for_each(|env| self.runner.carry_state(env, true));
+        (0..self.envs).for_each(|env| self.runner.next_state(env, true));
         while wave.running.iter().any(|&running| running) {
             if stop.load(Ordering::Acquire) {
                 return Ok(None);
@@ -253,7 +253,7 @@ impl Evaluator {
         let dims = self.runner.policy.layout().action_len;
         let mask = self.faults.failed().to_vec();
         for env in (0..self.envs).filter(|&env| mask[env]) {
-            self.runner.carry_state(env, true);
+            self.runner.next_state(env, true);
             if !wave.running[env] {
                 continue;
             }
@@ -302,7 +302,7 @@ impl Evaluator {
         wave.success[env] = self.environments.success()[env];
         let ended =
             self.environments.terminated()[env] == 1 || self.environments.truncated()[env] == 1;
-        self.runner.carry_state(env, ended);
+        self.runner.next_state(env, ended);
         wave.running[env] = !ended && wave.steps[env] < EPISODE_STEPS_MAX;
     }
 }

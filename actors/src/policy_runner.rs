@@ -20,8 +20,9 @@ pub struct PolicyRunner {
     pub u: Vec<f32>,
     /// Learned standard deviations of the policy, (A,); empty if they are not learned.
     pub std: Vec<f32>,
-    /// (y, yd) from which each environment's DMP continues, (E, 2A); empty if not carried.
-    carried: Vec<f32>,
+    /// (y, yd) at the start of each environment's segment, (E, 2A); empty if the policy has no
+    /// such state.
+    state: Vec<f32>,
     /// The segment's actions in the environments' units, (E, K, A).
     actions: Vec<f64>,
 }
@@ -32,14 +33,13 @@ impl PolicyRunner {
     pub fn new(policy: Policy, envs: usize) -> Self {
         let layout = policy.layout();
         let actions_len = envs * layout.segment_steps * layout.action_len;
-        let carried_len = layout.observation_len - policy.env_observation_len();
         Self {
             network: SmallBatchNetwork::new(policy.shape().clone()),
             work: policy.workspace(envs),
             observations: vec![0.0; envs * layout.observation_len],
             u: vec![0.0; actions_len],
             std: vec![0.0; policy.learned_std().map_or(0, LearnedStd::len)],
-            carried: vec![0.0; envs * carried_len],
+            state: vec![0.0; envs * policy.state_len()],
             actions: vec![0.0; actions_len],
             policy,
         }
@@ -54,8 +54,8 @@ impl PolicyRunner {
             for (seen, value) in seen.iter_mut().zip(row) {
                 *seen = *value as f32;
             }
-            let carried = len - env_len;
-            seen[env_len..].copy_from_slice(&self.carried[env * carried..(env + 1) * carried]);
+            let state_len = len - env_len;
+            seen[env_len..].copy_from_slice(&self.state[env * state_len..(env + 1) * state_len]);
         }
     }
 
@@ -105,30 +105,41 @@ impl PolicyRunner {
         &self.actions
     }
 
-    /// Writes (y, yd) of environment `env` after step `k` of the segment to `state`. Does nothing
-    /// if the state is not carried.
-    pub fn state_at(&self, env: usize, k: usize, state: &mut [f32]) {
-        if self.policy.carries_state()
+    /// Advances `state`, (y, yd) of environment `env`, from after step `k` - 1 of the segment to
+    /// after step `k`. Step 0 is the start of the segment. Does nothing if the policy has no state.
+    pub fn advance_state(&self, env: usize, k: usize, state: &mut [f32]) {
+        let layout = self.policy.layout();
+        if let Some(commands) = self.policy.command_state() {
+            if k == 0 {
+                let len = state.len();
+                state.copy_from_slice(&self.state[env * len..(env + 1) * len]);
+            } else {
+                let first = (env * layout.segment_steps + k - 1) * layout.action_len;
+                commands.follow(&self.u[first..first + layout.action_len], state);
+            }
+        } else if self.policy.carries_dmp_state()
             && let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &self.work.dmp)
         {
             head.state_at(dmp, env, k, state);
         }
     }
 
-    /// Sets the state from which environment `env`'s DMP continues: its state at the segment's end,
-    /// or zero if the episode has ended.
-    pub fn carry_state(&mut self, env: usize, ended: bool) {
-        let len = self.policy.layout().observation_len - self.policy.env_observation_len();
+    /// Sets the state from which environment `env`'s next segment starts: the one at the segment's
+    /// end, or zero if the episode has ended.
+    pub fn next_state(&mut self, env: usize, ended: bool) {
+        let len = self.policy.state_len();
         if len == 0 {
             return;
         }
-        let mut carried = std::mem::take(&mut self.carried);
-        let state = &mut carried[env * len..(env + 1) * len];
+        let mut all = std::mem::take(&mut self.state);
+        let state = &mut all[env * len..(env + 1) * len];
         if ended {
             state.fill(0.0);
         } else {
-            self.state_at(env, self.policy.layout().segment_steps, state);
+            for k in 1..=self.policy.layout().segment_steps {
+                self.advance_state(env, k, state);
+            }
         }
-        self.carried = carried;
+        self.state = all;
     }
 }

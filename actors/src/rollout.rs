@@ -264,7 +264,7 @@ impl Rollout {
         if let Some(hindsight) = &mut self.hindsight {
             hindsight.begin_episode(env);
         }
-        self.runner.carry_state(env, true);
+        self.runner.next_state(env, true);
         self.exploration.episode_ended(env);
         self.episodes[env] = Episode { number: self.episodes[env].number + 1, steps: 0 };
     }
@@ -289,7 +289,7 @@ impl Rollout {
         if flags & (TERMINATED | TRUNCATED) != 0 {
             self.faults.completed(env);
         } else {
-            self.runner.carry_state(env, false);
+            self.runner.next_state(env, false);
             self.episodes[env].steps += steps as u32;
         }
         Ok(())
@@ -326,11 +326,14 @@ impl Rollout {
         let (observations, actions, rewards) = layout.split_mut(&mut self.segment.block);
         let from = &self.environments.observations()[env * (k_max + 1) * env_len..];
         for k in 0..=steps {
-            let row = &mut observations[k * o..(k + 1) * o];
+            let (before, row) = observations[..(k + 1) * o].split_at_mut(k * o);
+            if let Some(before) = before.rchunks_exact(o).next() {
+                row[env_len..].copy_from_slice(&before[env_len..]);
+            }
             for (out, value) in row.iter_mut().zip(&from[k * env_len..(k + 1) * env_len]) {
                 *out = *value as f32;
             }
-            self.runner.state_at(env, k, &mut row[env_len..]);
+            self.runner.advance_state(env, k, &mut row[env_len..]);
         }
         observations[(steps + 1) * o..].fill(0.0);
         let u = &self.runner.u[env * k_max * a..(env + 1) * k_max * a];

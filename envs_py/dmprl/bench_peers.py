@@ -46,7 +46,7 @@ class RandomActor:
         """Returns actions of the shape of the policy's, (E, K, A)."""
         return self._random.uniform(self._low, self._high, self._shape)
 
-    def carry_on(self, ended: NDArray[np.bool_]) -> None:
+    def end_segments(self, ended: NDArray[np.bool_]) -> None:
         """Does nothing, because random actions have no state."""
 
 
@@ -130,7 +130,7 @@ class GymnasiumLoop:
                     ended[index] = True
                     break
             self._current[index] = observation
-        self._actor.carry_on(ended)
+        self._actor.end_segments(ended)
         return steps
 
 
@@ -185,7 +185,7 @@ class EnvPoolLoop:
             self._resets = terminated | truncated
             ended |= self._resets
         self._current = observations
-        self._actor.carry_on(ended)
+        self._actor.end_segments(ended)
         return steps
 
 

@@ -191,7 +191,7 @@ def episode_controls(plan: dict, seed: int, stage: Stage) -> NDArray[np.float64]
         for k in range(min(actions.shape[1], steps - len(controls))):
             observations, control = stage.step(actions[:, k])
             controls.append(control.copy())
-        actor.carry_on(none_ended)
+        actor.end_segments(none_ended)
     return np.stack(controls)
 
 

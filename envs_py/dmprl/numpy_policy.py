@@ -21,6 +21,8 @@ OCTAVES = 8
 """Number of octaves of the pink noise, as in Rust."""
 LOG_STD_RANGE = (-20.0, 2.0)
 """Range of the network's log-stds, as in Rust."""
+U_MAX = np.float32(0.995)
+"""Larger actions count as this one in the state of the commands, as in Rust."""
 
 
 class NumpyPolicy:
@@ -44,14 +46,16 @@ class NumpyPolicy:
             np.empty((self.env_count, width), np.float32) for width in plan["widths"][1:]
         ]
         self._head = DmpHead(plan) if plan["policy"]["kind"] == "dmp" else None
-        self._bounded = self._head is None or plan["policy"]["controller"] == "inverse"
+        self._bounded = self._head is None or plan["policy"]["controller"] != "position"
+        self._carries = self._head is not None and plan["policy"]["start"] == "carry"
+        self._follows = plan["policy"]["start"] == "action"
         # After the decisions, a network may output their log-stds.
         self._decisions: int = plan["widths"][-1] - plan["log_stds_len"]
         env_len = plan["spec"]["observation_len"]
         self._observations = np.zeros((self.env_count, plan["widths"][0]), np.float32)
-        # Views: the environment's observation, and the DMP state that a policy may carry.
+        # Views: the environment's observation, and the state (y, yd) that a policy may have.
         self._seen = self._observations[:, :env_len]
-        self.carried = self._observations[:, env_len:]
+        self.state = self._observations[:, env_len:]
 
     def u(self, observations: NDArray, noise: Noise | None = None) -> Floats:
         """Computes actions u, (E, K, A), for the environments' observations, (E, O).
@@ -84,15 +88,33 @@ class NumpyPolicy:
         """Clips ``u`` and scales it to the environment's units."""
         return self._mid + self._half_range * np.clip(u, -1.0, 1.0)
 
-    def carry_on(self, ended: NDArray[np.bool_]) -> None:
-        """Continues each DMP from its segment's end, or from rest if the episode ended."""
+    def end_segments(self, u: Floats, ended: NDArray[np.bool_]) -> None:
+        """Sets the state after segments of actions ``u``, (E, K, A); zero if the episode ended."""
         self.carry_from(self.segment_steps)
-        self.carried[ended] = 0.0
+        for step in range(self.segment_steps):
+            self.follow(u[:, step])
+        self.state[ended] = 0.0
 
     def carry_from(self, step: int) -> None:
-        """Continues each DMP from its state after 1 to K steps of its segment."""
-        if self._head is not None and self.carried.shape[1] > 0:
-            self.carried[:] = self._head.state_after(step)
+        """Sets the state to the DMP's after 1 to K steps, if the policy carries it."""
+        if self._carries:
+            self.state[:] = self._head.state_after(step)
+
+    def follow(self, u: Floats) -> None:
+        """Advances the state by a step with actions ``u``, (E, A), if it is that of the commands.
+
+        See ``shared/src/policy/command_state.rs``.
+        """
+        if self._follows:
+            y, yd = np.split(self.state, 2, axis=1)
+            after = np.arctanh(np.clip(u, -U_MAX, U_MAX))
+            yd[:] = (after - y) * np.float32(self.segment_steps)
+            y[:] = after
+
+    def unscaled(self, actions: NDArray[np.float64]) -> Floats:
+        """Computes u from actions in the environment's units."""
+        u = ((actions - self._mid) / self._half_range).astype(np.float32)
+        return np.clip(u, -1.0, 1.0)
 
 
 def layers(widths: list[int], parameters: Floats) -> list[tuple[Floats, Floats]]:
@@ -125,7 +147,8 @@ class DmpHead:
         self._map = np.ascontiguousarray(segment_map.T)
         self._goal_scaling = dmp["forcing_scaling"] == "goal"
         self._goal_range = np.float32(policy["goal_range"])
-        self._inverse = policy["controller"] == "inverse"
+        self._controller: str = policy["controller"]
+        self._inverse = self._controller == "inverse"
         self._position_scale = np.float32(policy["position_scale"])
         self._bounded = policy["rho"] == "bounded"
         self._rho_range = np.float32(policy["rho_range"] if self._bounded else 1.0)
@@ -140,7 +163,7 @@ class DmpHead:
         self._samples = np.zeros((*self._shape, 3 * self._steps), np.float32)
 
     def u(self, outputs: Floats, observations: Floats) -> Floats:
-        """Computes the segments' actions, (E, K, A); for the inverse controller before its tanh."""
+        """Computes the segments' actions, (E, K, A); before their tanh if they have one."""
         n, inputs = self._basis_count, self._inputs
         raw = outputs.reshape(*self._shape, 1 + n + (4 if self._inverse else 0))
         squashed = np.tanh(raw)
@@ -154,6 +177,8 @@ class DmpHead:
         if self._inverse:
             rho = (squashed if self._bounded else raw)[..., 1 + n :] * self._rho_range + RHO_CENTRE
             u = rho[..., 0:1] * y + rho[..., 1:2] * yd + rho[..., 2:3] * ydd + rho[..., 3:4]
+        elif self._controller == "direct":
+            u = y
         else:
             u = self._position_scale * np.diff(y, axis=-1, prepend=inputs[..., :1])
         return np.ascontiguousarray(u.transpose(0, 2, 1))
@@ -166,7 +191,7 @@ class DmpHead:
     def _read_start(self, observations: Floats) -> None:
         """Writes y0 and yd0 into the map's inputs."""
         y0, yd0 = self._inputs[..., 0], self._inputs[..., 1]
-        if self._start == "carry":
+        if self._start in ("carry", "action"):
             actions = self._shape[1]
             y0[:] = observations[:, self._env_len : self._env_len + actions]
             yd0[:] = observations[:, self._env_len + actions :]
@@ -252,9 +277,10 @@ class Actor:
 
     def actions(self, observations: NDArray) -> NDArray[np.float64]:
         """Computes the next segment's actions in the environment's units, (E, K, A)."""
-        return self._policy.scaled(self._policy.u(observations, self._noise))
+        self._u = self._policy.u(observations, self._noise)
+        return self._policy.scaled(self._u)
 
-    def carry_on(self, ended: NDArray[np.bool_]) -> None:
+    def end_segments(self, ended: NDArray[np.bool_]) -> None:
         """Ends a segment; ``ended`` are the environments whose episode has ended."""
-        self._policy.carry_on(ended)
+        self._policy.end_segments(self._u, ended)
         self._noise.episodes_ended(ended)

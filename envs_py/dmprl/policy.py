@@ -47,7 +47,7 @@ class Policy:
         self.low: Actions = np.array(spec["action_low"], np.float64)
         self.high: Actions = np.array(spec["action_high"], np.float64)
         self._network = NumpyPolicy(_plan(file), _flat(file))
-        self._carries = self._network.carried.shape[1] > 0
+        self._has_state = self._network.state.shape[1] > 0
         self.segment_steps: int = self._network.segment_steps
         """Control steps per decision, K."""
         self._rate: Actions = np.full(self.low.shape, np.inf)
@@ -167,13 +167,17 @@ class Policy:
         A limited rate starts from the hold, as if the robot had executed the hold before. State the
         robot's present position before, if it is held by one.
 
-        :param y0: start of the DMP, (A,) in units of y, for a policy that carries its state across
-            segments (``policy.start = "carry"``). The default is 0, as in training.
-        :raises ValueError: if y0 is not A finite numbers, or the policy does not carry its state.
+        :param y0: start of the DMP, (A,) in units of y, for a policy whose segments start where the
+            previous one ended (``policy.start = "carry"`` or ``"action"``). The default is 0, as in
+            training.
+        :raises ValueError: if y0 is not A finite numbers, or the policy has another start.
         """
         if y0 is not None:
-            if not self._carries:
-                raise ValueError("y0 must be None: this policy does not carry the DMP's state")
+            if not self._has_state:
+                raise ValueError(
+                    "y0 must be None: this policy's segments do not start where the previous one "
+                    "ended"
+                )
             y0 = np.asarray(y0, np.float32)
             if y0.shape != self.low.shape or not np.isfinite(y0).all():
                 raise ValueError(f"y0 is {y0}: expected {self.low.size} finite numbers")
@@ -181,9 +185,9 @@ class Policy:
             policy._start_episode(y0)
 
     def _start_episode(self, y0: NDArray[np.float32] | None = None) -> None:
-        self._network.carried[:] = 0.0
+        self._network.state[:] = 0.0
         if y0 is not None:
-            self._network.carried[0, : self.low.size] = y0
+            self._network.state[0, : self.low.size] = y0
         self._step = self.segment_steps
         self._previous: Actions | None = None
         self._called_at_s: float | None = None
@@ -322,6 +326,8 @@ class Policy:
         previous = first if self._previous is None else self._previous
         near = np.clip(wanted, previous - self._rate, previous + self._rate)
         self._previous = np.clip(near, self.low, self.high)
+        # Not the wanted action, because the robot gets this one.
+        self._network.follow(self._network.unscaled(self._previous)[None])
         return self._previous.copy()
 
     def _decide(self, seen: NDArray[np.float32]) -> None:
@@ -373,9 +379,10 @@ def _plan(file: PolicyFile) -> dict[str, Any]:
         if file.segment_map is None or file.segment_map.shape != expected:
             found = None if file.segment_map is None else file.segment_map.shape
             raise ValueError(f"segment_map has shape {found}, expected {expected}")
-    carried = 2 * spec["action_len"] if is_dmp and policy["start"] == "carry" else 0
+    has_state = policy["start"] == "action" or (is_dmp and policy["start"] == "carry")
+    state_len = 2 * spec["action_len"] if has_state else 0
     widths = [file.layers[0][0].shape[1], *(len(bias) for _, bias in file.layers)]
-    inputs = spec["observation_len"] + carried
+    inputs = spec["observation_len"] + state_len
     if widths[0] != inputs:
         raise ValueError(f"actor.0.weight has {widths[0]} inputs, expected {inputs}")
     # The network of SAC and TQC outputs the log-stds after the decisions.

@@ -8,9 +8,9 @@ from typing import Any
 WORDS = {
     "algorithm": ("ddpg", "td3", "sac", "tqc", "ndp"),
     "policy.kind": ("dmp", "mlp", "chunk"),
-    "policy.controller": ("inverse", "position"),
+    "policy.controller": ("inverse", "position", "direct"),
     "policy.rho": ("bounded", "free"),
-    "policy.start": ("zero", "observed", "carry"),
+    "policy.start": ("zero", "observed", "carry", "action"),
     "policy.start_velocity": ("measured", "zero"),
     "dmp.forcing_scaling": ("none", "goal"),
 }

@@ -12,6 +12,8 @@ import numpy as np
 import onnxruntime
 
 TOLERANCE = 1e-5
+TOLERANCE_ACTION = 1e-4
+"""For policies that see tanh⁻¹ of the last action: it multiplies rounding errors near bounds."""
 
 
 class ExportedGraphs(unittest.TestCase):
@@ -20,7 +22,7 @@ class ExportedGraphs(unittest.TestCase):
         self.folders = sorted(folder.iterdir())
 
     def test_each_graph_returns_rusts_actions(self) -> None:
-        self.assertGreaterEqual(len(self.folders), 9)
+        self.assertGreaterEqual(len(self.folders), 13)
         for folder in self.folders:
             with self.subTest(folder.name):
                 session = onnxruntime.InferenceSession(folder / "policy.onnx")
@@ -35,7 +37,9 @@ class ExportedGraphs(unittest.TestCase):
                     got = run_in_sequence(session, observations, inputs["state"][1])
                 else:
                     got = session.run(["actions"], {"observation": observations})[0]
-                self.assertLess(np.abs(got - expected).max(), TOLERANCE)
+                is_action = folder.name.startswith("action")
+                tolerance = TOLERANCE_ACTION if is_action else TOLERANCE
+                self.assertLess(np.abs(got - expected).max(), tolerance)
 
     def test_each_graph_contains_its_description(self) -> None:
         for folder in self.folders:

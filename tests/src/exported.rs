@@ -27,7 +27,7 @@ const CORNERS: [f64; 4] = [0.0, -0.0, 1.0, -1.0];
 type Keys = &'static [(&'static str, &'static str)];
 
 /// Name, task, and configuration keys that differ from the task's defaults.
-pub const KINDS: [(&str, &str, Keys); 10] = [
+pub const KINDS: [(&str, &str, Keys); 13] = [
     ("dmp", "reacher", &[]),
     ("mlp", "pusher", &[("policy.kind", "mlp")]),
     ("sac-chunk", "pusher", &[("algorithm.name", "sac"), ("policy.kind", "chunk")]),
@@ -45,6 +45,9 @@ pub const KINDS: [(&str, &str, Keys); 10] = [
         "pusher",
         &[("policy.start", "carry"), ("exploration.warm_up_kind", "dmp_parameters")],
     ),
+    ("action", "pusher", &[("policy.start", "action"), ("policy.controller", "direct")]),
+    ("action-chunk", "reacher", &[("policy.start", "action"), ("policy.kind", "chunk")]),
+    ("action-mlp", "reacher", &[("policy.start", "action"), ("policy.kind", "mlp")]),
     (
         "ndp",
         "reacher",

@@ -12,6 +12,7 @@ use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironmen
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
 use dmprl_shared::config::{ExperimentConfig, Layers, TaskConfig};
 use dmprl_shared::goal_rule::GoalReward;
+use dmprl_shared::policy::CommandState;
 use dmprl_shared::segment::{
     ActionBounds, Expected, HINDSIGHT, Segment, SegmentLayout, TERMINATED, TRUNCATED, check,
 };
@@ -131,6 +132,37 @@ fn copies_of_an_episode_have_goals_that_it_reached_and_their_rewards() {
         .map(|segment| segment.header.episode_step)
         .collect();
     assert!(firsts.iter().all(|&first| first <= 7) && firsts.len() == 8, "{firsts:?}");
+}
+
+/// With `policy.start = "action"`, (y, yd) of the action before follows every observation.
+#[test]
+fn segments_and_copies_contain_the_actions_before_each_step() {
+    let keys = [("policy.start", "action"), ("policy.controller", "direct")];
+    let mut rollout = started("Reach", &keys).unwrap();
+    let layout = SegmentLayout { observation_len: 6, ..LAYOUT };
+    assert_eq!(rollout.policy().layout(), layout);
+    let segments = delivered(&mut rollout, 6);
+    let mut states: BTreeMap<(u32, u32), Vec<[f32; 2]>> = BTreeMap::new();
+    let key = |segment: &Segment| (segment.header.env_index, segment.header.episode);
+    for segment in segments.iter().filter(|segment| !is_copy(segment)) {
+        // An episode starts at rest.
+        let states = states.entry(key(segment)).or_insert_with(|| vec![[0.0; 2]]);
+        let (_, actions, _) = layout.split(&segment.block);
+        for u in &actions[..segment.header.steps_len as usize] {
+            let y = u.clamp(-CommandState::U_MAX, CommandState::U_MAX).atanh();
+            states.push([y, 5.0 * (y - states.last().unwrap()[0])]);
+        }
+    }
+    let mut copies = 0;
+    for segment in &segments {
+        let first = segment.header.episode_step as usize;
+        let rows = segment.block.chunks_exact(6).take(segment.header.steps_len as usize + 1);
+        for (row, seen) in rows.enumerate() {
+            assert_eq!(seen[4..], states[&key(segment)][first + row], "step {}", first + row);
+        }
+        copies += usize::from(is_copy(segment));
+    }
+    assert!(copies > 0);
 }
 
 /// With a proven rule the learner draws the goals, so the worker sends each step once.

@@ -28,7 +28,7 @@ plan = json.load(open(sys.argv[1]))
 policy = NumpyPolicy(plan)
 seen = np.fromfile(sys.argv[2], '<f4').reshape(policy.env_count, -1)
 env_len = plan['spec']['observation_len']
-policy.carried[:] = seen[:, env_len:]
+policy.state[:] = seen[:, env_len:]
 u = policy.u(seen[:, :env_len])
 u.astype('<f4').tofile(sys.argv[3])
 policy.scaled(u).astype('<f4').tofile(sys.argv[4])
@@ -135,6 +135,7 @@ fn movement_primitives_of_other_kinds_act_the_same() {
     assert_same("panda-reach", &[("policy.start", "observed")]);
     let drawn = ("exploration.warm_up_kind", "dmp_parameters");
     assert_same("pusher", &[drawn, ("policy.start", "carry")]);
+    assert_same("pusher", &[("policy.start", "action"), ("policy.controller", "direct")]);
     assert_same("reacher", &[("dmp.forcing_scaling", "goal"), ("dmp.integrator", "explicit")]);
     let stochastic = [
         ("algorithm.name", "ndp"),

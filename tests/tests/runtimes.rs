@@ -19,6 +19,9 @@ use dmprl_tests::{project_root, venv};
 
 /// Both compute in f32 and sum in different orders.
 const TOLERANCE: f64 = 1e-5;
+/// The same for policies that see tanh⁻¹ of the last action, which multiplies rounding errors by up
+/// to 100 near the bounds.
+const TOLERANCE_ACTION: f64 = 1e-4;
 /// Number of control steps in the second test.
 const STEPS: usize = 120;
 
@@ -39,7 +42,8 @@ fn python(script: &str, folder: &Path) -> String {
 fn assert_near(got: &[f64], expected: &[f64], what: &str) {
     assert_eq!(got.len(), expected.len(), "{what}");
     let largest = got.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-    assert!(largest <= TOLERANCE, "{what}: off by {largest}, at most {TOLERANCE}");
+    let tolerance = if what.starts_with("action") { TOLERANCE_ACTION } else { TOLERANCE };
+    assert!(largest <= tolerance, "{what}: off by {largest}, at most {tolerance}");
 }
 
 #[test]

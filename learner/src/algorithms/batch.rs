@@ -54,7 +54,7 @@ impl BatchShape {
     pub fn new(config: &AlgorithmConfig, policy: &Policy, rule: Option<&GoalRule>) -> Self {
         let layout = policy.layout();
         let segment_actions_len = layout.segment_steps * layout.action_len;
-        let carried = if policy.carries_state() { 2 * layout.action_len } else { 0 };
+        let carried = if policy.carries_dmp_state() { 2 * layout.action_len } else { 0 };
         let whole = config.critic == CriticInput::Segment;
         Self {
             rows: config.batch_size,

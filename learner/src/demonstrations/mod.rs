@@ -7,8 +7,8 @@ mod file;
 
 use std::path::{Path, PathBuf};
 
-use dmprl_shared::policy::Policy;
-use dmprl_shared::segment::{SegmentHeader, TERMINATED, TRUNCATED};
+use dmprl_shared::policy::{CommandState, Policy};
+use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 use dmprl_shared::spec::EnvSpec;
 use thiserror::Error;
 
@@ -59,7 +59,7 @@ pub enum DemonstrationError {
 /// N recorded steps in order, episode after episode.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Demonstration {
-    /// Observations before each step, (N, O).
+    /// Observations before each step, (N, O), with the state of the commands if the policy has it.
     pub observations: Vec<f32>,
     /// Actions u in [-1, 1], (N, A).
     pub actions: Vec<f32>,
@@ -90,7 +90,11 @@ impl Demonstration {
     /// # Errors
     /// If the file is unreadable or an array is invalid.
     pub fn read(path: &Path, spec: &EnvSpec, policy: &Policy) -> Result<Self, DemonstrationError> {
-        file::read(path, spec, policy.scaling())
+        let mut demonstration = file::read(path, spec, policy.scaling())?;
+        if let Some(commands) = policy.command_state() {
+            demonstration.append_states(commands, policy.layout());
+        }
+        Ok(demonstration)
     }
 
     /// Returns the number of steps, N.
@@ -113,6 +117,27 @@ impl Demonstration {
             steps: self.len(),
             rewards: self.rewards.iter().map(|reward| f64::from(*reward)).sum(),
         }
+    }
+
+    /// Appends the state of the commands to every observation.
+    fn append_states(&mut self, commands: &CommandState, layout: SegmentLayout) {
+        let (o, a) = (layout.observation_len, layout.action_len);
+        let env_len = o - 2 * a;
+        let mut state = vec![0.0; 2 * a];
+        let (mut observations, mut next_observations) = (Vec::new(), Vec::new());
+        for row in 0..self.len() {
+            let own = row * env_len..(row + 1) * env_len;
+            observations.extend_from_slice(&self.observations[own.clone()]);
+            observations.extend_from_slice(&state);
+            commands.follow(&self.actions[row * a..(row + 1) * a], &mut state);
+            next_observations.extend_from_slice(&self.next_observations[own]);
+            next_observations.extend_from_slice(&state);
+            if self.is_end(row) {
+                state.fill(0.0);
+            }
+        }
+        self.observations = observations;
+        self.next_observations = next_observations;
     }
 
     fn is_end(&self, row: usize) -> bool {

@@ -102,6 +102,24 @@ fn a_file_is_read_as_it_was_written() {
     assert_eq!(read.summary(), summary);
 }
 
+#[test]
+fn states_of_the_commands_follow_the_recorded_actions() {
+    let learner = learner(&[("policy.start", "action"), ("policy.controller", "direct")]);
+    let read = read_for(&learner, &arrays()).unwrap();
+    assert_eq!((read.observations.len(), read.next_observations.len()), (10 * 8, 10 * 8));
+    let commands = learner.policy().command_state().unwrap();
+    let mut state = [0.0; 4];
+    for (row, seen) in read.observations.chunks_exact(8).enumerate() {
+        // Each of the two episodes begins at rest.
+        if row == 7 {
+            state = [0.0; 4];
+        }
+        assert_eq!((&seen[..4], &seen[4..]), (&steps().observations[4 * row..][..4], &state[..]));
+        commands.follow(&read.actions[2 * row..][..2], &mut state);
+        assert_eq!(read.next_observations[8 * row + 4..][..4], state);
+    }
+}
+
 /// Damages each array in turn. The message names the array, the expected and the actual value.
 #[test]
 fn what_does_not_fit_is_refused_by_name_with_expected_and_got() {

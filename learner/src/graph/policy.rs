@@ -1,7 +1,7 @@
 //! The policy as a graph of candle tensors: network, DMP, inverse controller and SAC's Gaussian.
 
 use candle_core::{D, Device, Result, Tensor};
-use dmprl_shared::config::{ExperimentConfig, ForcingScaling, RhoKind};
+use dmprl_shared::config::{Controller, ExperimentConfig, ForcingScaling, RhoKind};
 use dmprl_shared::dmp::{Dmp, SegmentMap};
 use dmprl_shared::policy::{Head, MlpShape, Policy};
 
@@ -31,6 +31,7 @@ struct DmpGraph {
     rho: RhoKind,
     rho_range: f64,
     forcing_scaling: ForcingScaling,
+    controller: Controller,
     carries_state: bool,
 }
 
@@ -124,38 +125,50 @@ impl DmpGraph {
             rho: config.policy.rho,
             rho_range: config.policy.rho_range,
             forcing_scaling: dmp.forcing_scaling,
-            carries_state: policy.carries_state(),
+            controller: config.policy.controller,
+            carries_state: policy.carries_dmp_state(),
         })
     }
 
-    /// Computes means and end state from the network's outputs, (B, A (1+N+4)).
+    /// Computes means and end state from the network's outputs, (B, A (1+N+4)); without the
+    /// inverse controller, (B, A (1+N)).
     fn segment(&self, outputs: &Tensor, starts: &Tensor) -> Result<(Tensor, Option<Tensor>)> {
         let (dims, k, n) = (self.dims, self.steps, self.basis_count);
         let rows = outputs.dim(0)?;
-        let cells = outputs.reshape((rows * dims, n + 5))?;
+        let cells = outputs.reshape((rows * dims, outputs.dim(1)? / dims))?;
         let goal = (cells.narrow(1, 0, 1)?.tanh()? * self.goal_range)?;
         let mut weights = cells.narrow(1, 1, n)?.tanh()?;
         if self.forcing_scaling == ForcingScaling::Goal {
             weights = weights.broadcast_mul(&(&goal - starts.narrow(1, 0, 1)?)?)?;
         }
-        let rho = cells.narrow(1, n + 1, 4)?;
-        let rho = match self.rho {
-            RhoKind::Bounded => (rho.tanh()? * self.rho_range)?,
-            RhoKind::Free => rho,
-        };
-        let rho = rho.broadcast_add(&self.rho_centre)?;
         let samples = Tensor::cat(&[starts, &goal, &weights], 1)?.matmul(&self.matrix)?;
-        let mut v = rho.narrow(1, 3, 1)?.broadcast_as((rows * dims, k))?;
-        for part in 0..3 {
-            let sample = samples.narrow(1, part * k, k)?;
-            v = (v + sample.broadcast_mul(&rho.narrow(1, part, 1)?)?)?;
-        }
+        let v = match self.controller {
+            Controller::Inverse => self.control(&cells.narrow(1, n + 1, 4)?, &samples)?,
+            Controller::Direct => samples.narrow(1, 0, k)?,
+            Controller::Position => candle_core::bail!("a graph has no position controller"),
+        };
         let means = v.reshape((rows, dims, k))?.transpose(1, 2)?.reshape((rows, k * dims))?;
         if !self.carries_state {
             return Ok((means, None));
         }
         let end = |at: usize| samples.narrow(1, at, 1)?.reshape((rows, dims));
         Ok((means, Some(Tensor::cat(&[&end(k - 1)?, &end(2 * k - 1)?], 1)?)))
+    }
+
+    /// Computes the inverse controller's output before tanh, (B A, K), from the outputs for rho,
+    /// (B A, 4), and the samples.
+    fn control(&self, rho: &Tensor, samples: &Tensor) -> Result<Tensor> {
+        let rho = match self.rho {
+            RhoKind::Bounded => (rho.tanh()? * self.rho_range)?,
+            RhoKind::Free => rho.clone(),
+        };
+        let rho = rho.broadcast_add(&self.rho_centre)?;
+        let mut v = rho.narrow(1, 3, 1)?.broadcast_as((rho.dim(0)?, self.steps))?;
+        for part in 0..3 {
+            let sample = samples.narrow(1, part * self.steps, self.steps)?;
+            v = (v + sample.broadcast_mul(&rho.narrow(1, part, 1)?)?)?;
+        }
+        Ok(v)
     }
 }
 

@@ -156,6 +156,8 @@ pub enum Controller {
     /// Successive differences of y, times `position_scale` (Neural Dynamic Policies). These actions
     /// are unbounded, so only algorithms that clip actions accept this controller.
     Position,
+    /// u = tanh(y), without a controller. With `start = "action"` the actions are continuous.
+    Direct,
 }
 
 /// Initial state of a segment's DMP.
@@ -168,6 +170,9 @@ pub enum Start {
     Observed,
     /// y and yd continue from the end of the previous segment; they are zero after a reset.
     Carry,
+    /// y0 is tanh⁻¹ of the last action, and yd0 is its change in the last step; both are zero after
+    /// a reset. Networks see them as part of the observation, those of `mlp` and `chunk` too.
+    Action,
 }
 
 /// Source of yd0 for `start = "observed"`.
@@ -273,5 +278,24 @@ impl PolicyConfig {
             PolicyKind::Dmp | PolicyKind::Chunk => self.segment_steps,
             PolicyKind::Mlp => 1,
         }
+    }
+
+    /// Returns the length of the state (y, yd) that follows the environment's observation: 2A or 0.
+    #[must_use]
+    pub fn state_len(&self, action_len: usize) -> usize {
+        let has_state = self.follows_actions() || self.carries_dmp_state();
+        if has_state { 2 * action_len } else { 0 }
+    }
+
+    /// Returns whether the observation contains the last action and its change.
+    #[must_use]
+    pub fn follows_actions(&self) -> bool {
+        self.start == Start::Action
+    }
+
+    /// Returns whether the observation contains the DMP's own state.
+    #[must_use]
+    pub fn carries_dmp_state(&self) -> bool {
+        self.kind == PolicyKind::Dmp && self.start == Start::Carry
     }
 }

@@ -4,8 +4,8 @@ mod algorithms;
 
 use super::endpoint::{is_endpoint, is_plain};
 use super::{
-    AlgorithmName, ConfigError, CriticInput, DeliveryLevel, ExperimentConfig, PolicyKind, Start,
-    WarmUpKind, Windows,
+    AlgorithmName, ConfigError, Controller, CriticInput, DeliveryLevel, ExperimentConfig,
+    PolicyKind, Start, WarmUpKind, Windows,
 };
 
 /// Properties of the machine, passed in by the caller.
@@ -248,7 +248,7 @@ impl ExperimentConfig {
         range("algorithm.motion_bonus", bonus, bonus.is_finite() && bonus >= 0.0, || {
             "0 or more".into()
         })?;
-        let carry = self.policy.kind == PolicyKind::Dmp && self.policy.start == Start::Carry;
+        let carry = self.policy.carries_dmp_state();
         range("exploration.random_segments", random, !carry || random == 0.0, || {
             "0 with policy.start = \"carry\", because random actions leave y undefined".into()
         })?;
@@ -300,7 +300,7 @@ impl ExperimentConfig {
         range("exploration.kind", "dmp_parameters", dmp || !perturbs_dmp_parameters, || {
             format!("another kind with policy.kind = \"{kind}\", which has no DMP parameters")
         })?;
-        let carry = dmp && self.policy.start == Start::Carry;
+        let carry = self.policy.carries_dmp_state();
         range("exploration.warm_up_kind", "uniform", draws_dmp_parameters || !carry, || {
             "dmp_parameters with policy.start = \"carry\", because uniform actions leave y \
              undefined during the warm-up"
@@ -308,7 +308,12 @@ impl ExperimentConfig {
         })?;
         let demonstrated = !self.demonstrations.files.is_empty();
         range("policy.start", "carry", !(carry && demonstrated), || {
-            "\"zero\" or \"observed\" with demonstrations, which do not contain the state of a DMP"
+            "zero, observed or action with demonstrations, which do not contain the state of a DMP"
+                .into()
+        })?;
+        let position = dmp && self.policy.controller == Controller::Position;
+        range("policy.start", "action", !(position && self.policy.follows_actions()), || {
+            "another start with policy.controller = \"position\", whose actions are no positions"
                 .into()
         })?;
         let observed = dmp && self.policy.start == Start::Observed;
@@ -393,6 +398,9 @@ mod tests {
         assert!(error(("exploration.warm_up_steps", "1")).contains("its own policy"));
         assert!(error(("algorithm.action_rate_penalty", "0.1")).contains("the other algorithms"));
         assert!(error(("policy.start", "observed")).contains("start_sources"));
+        let keys = [("policy.controller", "position"), ("policy.start", "action")];
+        let error = resolved(&[&[ndp, no_warm_up, no_penalty], &keys[..]].concat()).unwrap_err();
+        assert!(error.to_string().contains("no positions"), "{error}");
     }
 
     #[test]

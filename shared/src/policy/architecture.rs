@@ -38,6 +38,9 @@ pub(super) fn hash(config: &ExperimentConfig, spec: &EnvSpec) -> u64 {
         PolicyKind::Chunk => list.push_str(&format!(" chunk {}", config.policy.segment_steps)),
         PolicyKind::Dmp => list.push_str(&dmp(config, spec)),
     }
+    if config.policy.follows_actions() {
+        list.push_str(" follows actions");
+    }
     if config.algorithm.name.has_gaussian_policy() {
         list.push_str(" squashed gaussian");
     }
@@ -80,8 +83,10 @@ fn dmp(config: &ExperimentConfig, spec: &EnvSpec) -> String {
         policy.start,
         policy.start_velocity,
     );
-    if policy.controller == Controller::Position {
-        list.push_str(&format!(" position {:?}", policy.position_scale));
+    match policy.controller {
+        Controller::Inverse => {}
+        Controller::Position => list.push_str(&format!(" position {:?}", policy.position_scale)),
+        Controller::Direct => list.push_str(" direct"),
     }
     if policy.start == crate::config::Start::Observed {
         list.push_str(&format!(" {:?}", spec.control_dt_s));

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::{Policy, PolicyError};
 use crate::config::{
     AlgorithmName, ConfigError, DmpConfig, ExperimentConfig, Layers, Limits, PolicyConfig,
-    PolicyKind, Start, StartSource, WarmUpKind, algorithm_defaults, policy_defaults,
+    StartSource, WarmUpKind, algorithm_defaults, policy_defaults,
 };
 use crate::spec::EnvSpec;
 
@@ -61,7 +61,7 @@ impl PolicyDescription {
         config.policy = self.policy.clone();
         config.dmp = self.dmp.clone();
         config.task.start_sources.clone_from(&self.start_sources);
-        if self.policy.kind == PolicyKind::Dmp && self.policy.start == Start::Carry {
+        if self.policy.carries_dmp_state() {
             config.exploration.warm_up_kind = WarmUpKind::DmpParameters;
         }
         config.resolve(Limits { cores: 1 })

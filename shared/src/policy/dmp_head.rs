@@ -2,21 +2,14 @@
 //!
 //! The outputs of one action dimension are adjacent: goal, N weights, 4 rho. With t = tanh(output):
 //! g = goal_range t, w = weight_range omega² t, and rho = (1, 0, 0, 0) + rho_range t. With
-//! `rho = "free"`, rho = (1, 0, 0, 0) + output. With `controller = "position"` there is no rho.
+//! `rho = "free"`, rho = (1, 0, 0, 0) + output. Other controllers than `inverse` have no rho.
 
 use super::PolicyError;
 use super::start::StartState;
 use super::tanh;
-use crate::config::{Controller, ExperimentConfig, PolicyKind, RhoKind, Start};
+use crate::config::{Controller, ExperimentConfig, RhoKind};
 use crate::dmp::{Dmp, SegmentMap, act, act_backward, act_position, act_position_backward};
 use crate::spec::EnvSpec;
-
-/// Returns the length of the DMP state (y, yd) that follows the observation with
-/// `start = "carry"`; otherwise 0.
-pub(super) fn carried_len(config: &ExperimentConfig, spec: &EnvSpec) -> usize {
-    let carries = config.policy.kind == PolicyKind::Dmp && config.policy.start == Start::Carry;
-    if carries { 2 * spec.action_len } else { 0 }
-}
 
 /// Number of inverse-controller parameters per dimension.
 const RHO_LEN: usize = 4;
@@ -79,7 +72,7 @@ impl DmpHead {
         Ok(Self {
             map: SegmentMap::new(&dmp, weight_scale),
             start: StartState::new(config, spec)?,
-            observation_len: spec.observation_len + carried_len(config, spec),
+            observation_len: spec.observation_len + config.policy.state_len(spec.action_len),
             dims: spec.action_len,
             steps: config.policy.segment_steps,
             basis_count: config.dmp.basis_count,
@@ -102,7 +95,7 @@ impl DmpHead {
         1 + self.basis_count
             + match self.controller {
                 Controller::Inverse => RHO_LEN,
-                Controller::Position => 0,
+                Controller::Position | Controller::Direct => 0,
             }
     }
 
@@ -175,6 +168,7 @@ impl DmpHead {
                     Controller::Position => {
                         act_position(inputs[0], samples, self.position_scale, &mut scratch.means);
                     }
+                    Controller::Direct => scratch.means.copy_from_slice(&samples[..steps]),
                 }
                 for (k, mean) in scratch.means.iter().enumerate() {
                     means[k * dims + d] = *mean;
@@ -290,6 +284,12 @@ impl DmpHead {
                 act_position_backward(self.position_scale, means_gradient, samples_gradient);
                 [0.0; RHO_LEN]
             }
+            Controller::Direct => {
+                let (y, others) = samples_gradient.split_at_mut(self.steps);
+                y.copy_from_slice(means_gradient);
+                others.fill(0.0);
+                [0.0; RHO_LEN]
+            }
         }
     }
 
@@ -305,7 +305,7 @@ impl DmpHead {
         for i in 0..self.basis_count {
             out[1 + i] = inputs_gradient[3 + i] * slope(squashed[1 + i]);
         }
-        if self.controller == Controller::Position {
+        if self.controller != Controller::Inverse {
             return;
         }
         for (i, gradient) in rho_gradient.iter().enumerate() {

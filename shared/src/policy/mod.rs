@@ -14,6 +14,7 @@
 
 mod action_scaling;
 mod architecture;
+mod command_state;
 mod description;
 mod dmp_head;
 pub mod gaussian;
@@ -30,6 +31,7 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 use thiserror::Error;
 
 pub use action_scaling::ActionScaling;
+pub use command_state::CommandState;
 pub use description::PolicyDescription;
 pub use dmp_head::{DmpHead, DmpWorkspace, HeadGradient};
 pub use hold::{Hold, HoldError};
@@ -90,6 +92,7 @@ pub struct Policy {
     squashes: bool,
     scaling: ActionScaling,
     env_observation_len: usize,
+    command_state: Option<CommandState>,
     architecture_hash: u64,
     description: PolicyDescription,
 }
@@ -118,7 +121,7 @@ impl Policy {
         let steps = config.policy.decision_steps();
         let layout = SegmentLayout {
             segment_steps: steps,
-            observation_len: spec.observation_len + dmp_head::carried_len(config, spec),
+            observation_len: spec.observation_len + config.policy.state_len(spec.action_len),
             action_len: spec.action_len,
         };
         let head = match config.policy.kind {
@@ -138,12 +141,13 @@ impl Policy {
             shape: MlpShape::new(widths),
             learned_std: LearnedStd::of(config, spec),
             squashes: config.policy.kind != PolicyKind::Dmp
-                || config.policy.controller == Controller::Inverse,
+                || config.policy.controller != Controller::Position,
             head,
             head_outputs,
             layout,
             scaling: ActionScaling::new(spec, config.policy.action_range),
             env_observation_len: spec.observation_len,
+            command_state: config.policy.follows_actions().then(|| CommandState::new(steps)),
             architecture_hash: architecture::hash(config, spec),
             description: PolicyDescription::new(config, spec),
         })
@@ -217,16 +221,30 @@ impl Policy {
         &self.scaling
     }
 
-    /// Length of the environment's part of an observation. A carried DMP state follows it.
+    /// Length of the environment's part of an observation. The state of the DMP or of the commands
+    /// follows it, if the policy has one.
     #[must_use]
     pub fn env_observation_len(&self) -> usize {
         self.env_observation_len
     }
 
-    /// Whether (y, yd) continue across segments and are part of the observation.
+    /// Length of the state (y, yd) that follows the environment's observation: 2A or 0.
     #[must_use]
-    pub fn carries_state(&self) -> bool {
-        self.layout.observation_len > self.env_observation_len
+    pub fn state_len(&self) -> usize {
+        self.layout.observation_len - self.env_observation_len
+    }
+
+    /// How the state follows the actions, with `start = "action"`.
+    #[must_use]
+    pub fn command_state(&self) -> Option<&CommandState> {
+        self.command_state.as_ref()
+    }
+
+    /// Whether the state is the DMP's own, which continues across segments. Then the critic also
+    /// sees the state after the segment, which its actions do not determine.
+    #[must_use]
+    pub fn carries_dmp_state(&self) -> bool {
+        self.state_len() > 0 && self.command_state.is_none()
     }
 
     /// Draws initial parameters.

@@ -18,8 +18,8 @@ pub enum StartState {
         /// converts velocities to DMP time, in which a segment lasts tau = 1.
         velocity_scale: f32,
     },
-    /// Carried: y (A,), then yd (A,) follow the environment's observation at this index.
-    Carry {
+    /// y (A,), then yd (A,) follow the environment's observation at this index.
+    Appended {
         /// Length of the environment's observation.
         at: usize,
     },
@@ -33,7 +33,7 @@ impl StartState {
     pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
         match config.policy.start {
             Start::Zero => Ok(Self::Zero),
-            Start::Carry => Ok(Self::Carry { at: spec.observation_len }),
+            Start::Carry | Start::Action => Ok(Self::Appended { at: spec.observation_len }),
             Start::Observed => {
                 let sources = config.task.start_sources.clone();
                 check(&sources, spec)?;
@@ -50,7 +50,7 @@ impl StartState {
     pub fn read(&self, observation: &[f32], d: usize, dims: usize) -> (f32, f32) {
         match self {
             Self::Zero => (0.0, 0.0),
-            Self::Carry { at } => (observation[at + d], observation[at + dims + d]),
+            Self::Appended { at } => (observation[at + d], observation[at + dims + d]),
             Self::Observed { sources, velocity_scale } => match &sources[d] {
                 StartSource::Angle { cos, sin, velocity } => {
                     // Adding 0 turns -0 into 0, for which atan2 returns pi instead of -pi.

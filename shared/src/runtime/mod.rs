@@ -34,10 +34,13 @@ pub struct PolicyRuntime {
     work: PolicyWorkspace,
     safety: Safety,
     deadline: Option<Deadline>,
-    /// The policy's input, (O,): the environment's observation, then a carried DMP state.
+    /// The policy's input, (O,): the environment's observation, then the state of the DMP or of
+    /// the commands.
     seen: Vec<f32>,
-    /// Start (y, yd) of the next segment's DMP, (2A,); empty if it is not carried.
-    carried: Vec<f32>,
+    /// State (y, yd) at the next segment's start, (2A,); empty if the policy has none.
+    state: Vec<f32>,
+    /// The last action as u in [-1, 1], (A,).
+    last_u: Vec<f32>,
     /// The segment's actions before limits, (K, A), in the environment's units.
     decided: Vec<f64>,
     /// The segment's actions after limits, (K, A).
@@ -82,7 +85,8 @@ impl PolicyRuntime {
         Self {
             work: policy.workspace(1),
             seen: vec![0.0; layout.observation_len],
-            carried: vec![0.0; layout.observation_len - policy.env_observation_len()],
+            state: vec![0.0; policy.state_len()],
+            last_u: vec![0.0; layout.action_len],
             decided: vec![0.0; layout.actions_len()],
             given: vec![0.0; layout.actions_len()],
             step: layout.segment_steps,
@@ -153,24 +157,27 @@ impl PolicyRuntime {
     ///
     /// A rate limit applies from the first action on, relative to the hold.
     ///
-    /// - `y0`: start of the DMP, (A,) in units of y, for a policy that carries its state across
-    ///   segments (`policy.start = "carry"`). The default is 0, as in training.
+    /// - `y0`: start of the DMP, (A,) in units of y, for a policy whose segments start where the
+    ///   previous one ended (`policy.start = "carry"` or `"action"`). The default is 0, as in
+    ///   training.
     ///
     /// # Errors
-    /// `Start` if y0 is not A finite numbers, or if the policy does not carry its state.
+    /// `Start` if y0 is not A finite numbers, or if the policy has another start.
     pub fn reset(&mut self, y0: Option<&[f32]>) -> Result<(), RuntimeError> {
         if let Some(y0) = y0 {
             let dims = self.policy.layout().action_len;
-            if self.carried.is_empty() {
-                return Err(RuntimeError::start("it does not carry its DMP state"));
+            if self.state.is_empty() {
+                return Err(RuntimeError::start(
+                    "its segments do not start where the previous one ended",
+                ));
             }
             if y0.len() != dims || y0.iter().any(|y| !y.is_finite()) {
                 return Err(RuntimeError::start(&format!("expected {dims} finite numbers")));
             }
         }
-        self.carried.fill(0.0);
+        self.state.fill(0.0);
         if let Some(y0) = y0 {
-            self.carried[..y0.len()].copy_from_slice(y0);
+            self.state[..y0.len()].copy_from_slice(y0);
         }
         self.step = self.segment_steps();
         self.missed = 0;
@@ -286,6 +293,7 @@ impl PolicyRuntime {
     fn approach_hold(&mut self) -> Result<&[f64], RuntimeError> {
         self.begin_at_hold();
         self.safety.limit(self.safety.hold()?, &mut self.previous);
+        self.follow_command();
         Ok(&self.previous)
     }
 
@@ -307,20 +315,30 @@ impl PolicyRuntime {
         self.safety.limit(&self.decided[cells.clone()], &mut self.previous);
         self.given[cells].copy_from_slice(&self.previous);
         self.step += 1;
-        if let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &self.work.dmp)
-            && !self.carried.is_empty()
+        if self.policy.carries_dmp_state()
+            && let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &self.work.dmp)
         {
-            head.state_at(dmp, 0, self.step, &mut self.carried);
+            head.state_at(dmp, 0, self.step, &mut self.state);
+        }
+        self.follow_command();
+    }
+
+    /// Advances the state of the commands by the previous action: the one after limits, because
+    /// the robot got it.
+    fn follow_command(&mut self) {
+        if let Some(commands) = self.policy.command_state() {
+            self.policy.scaling().invert(&self.previous, &mut self.last_u);
+            commands.follow(&self.last_u, &mut self.state);
         }
     }
 
     fn decide(&mut self, observation: &[f64]) -> Result<(), RuntimeError> {
         self.check(observation)?;
-        let (of_environment, of_dmp) = self.seen.split_at_mut(observation.len());
+        let (of_environment, of_state) = self.seen.split_at_mut(observation.len());
         for (seen, value) in of_environment.iter_mut().zip(observation) {
             *seen = *value as f32;
         }
-        of_dmp.copy_from_slice(&self.carried);
+        of_state.copy_from_slice(&self.state);
         self.network.forward(&self.seen, &mut self.work.activations);
         self.policy.decode(&self.seen, &mut self.work);
         // Far outside the training data, sums of large numbers may be NaN.

@@ -48,6 +48,7 @@ fn position(values: &[f64]) -> Hold {
 }
 
 const CARRY: &[(&str, &str)] = &[("policy.start", "carry")];
+const ACTION: &[(&str, &str)] = &[("policy.start", "action"), ("policy.controller", "direct")];
 
 fn observation(seed: f64) -> [f64; 4] {
     std::array::from_fn(|i| (seed + i as f64).sin())
@@ -55,7 +56,7 @@ fn observation(seed: f64) -> [f64; 4] {
 
 #[test]
 fn segment_equals_the_policys_decision_in_the_environments_units() {
-    for keys in [&[][..], &[("policy.kind", "mlp")], CARRY, &[("algorithm.name", "sac")]] {
+    for keys in [&[][..], &[("policy.kind", "mlp")], CARRY, ACTION, &[("algorithm.name", "sac")]] {
         let mut runtime = runtime(keys);
         let own = policy(keys);
         let mut parameters = own.initial_parameters(&mut seeds::stream(1, "test", 0));
@@ -76,7 +77,7 @@ fn segment_equals_the_policys_decision_in_the_environments_units() {
 
 #[test]
 fn actions_step_by_step_equal_the_segment() {
-    for keys in [&[][..], CARRY] {
+    for keys in [&[][..], CARRY, ACTION] {
         let (mut whole, mut stepwise) = (runtime(keys), runtime(keys));
         stepwise.safety_mut().set_hold(&position(&[0.0, 1.0])).unwrap();
         for decision in 0..3 {
@@ -89,6 +90,28 @@ fn actions_step_by_step_equal_the_segment() {
                 assert_eq!(action, expected, "{keys:?}, decision {decision}, step {k}");
             }
         }
+    }
+}
+
+/// Segments start where the robot is: at the last action after limits, held ones included.
+#[test]
+fn state_of_the_commands_follows_the_actions_that_were_given() {
+    for keys in [ACTION, &[("policy.start", "action"), ("policy.kind", "mlp")]] {
+        let mut runtime = runtime(keys);
+        runtime.safety_mut().set_hold(&position(&[0.0, 2.5])).unwrap();
+        runtime.safety_mut().set_rate(&[0.05, 0.05]).unwrap();
+        let (mut state, mut u) = (vec![0.0; 2 * DIMS], vec![0.0; DIMS]);
+        for step in 0..40 {
+            let now = observation(f64::from(step));
+            // Observations are missing for a while.
+            let action = runtime.action((!(10..20).contains(&step)).then_some(&now[..])).unwrap();
+            let action = action.to_vec();
+            runtime.policy.scaling().invert(&action, &mut u);
+            runtime.policy.command_state().unwrap().follow(&u, &mut state);
+            assert_eq!(runtime.state, state, "{keys:?}, step {step}");
+        }
+        runtime.reset(Some(&[0.25, -0.5])).unwrap();
+        assert_eq!(runtime.state, [0.25, -0.5, 0.0, 0.0]);
     }
 }
 
@@ -327,7 +350,7 @@ fn caller_that_was_frozen_gets_the_hold_and_then_a_new_decision() {
 #[test]
 fn only_a_policy_that_carries_its_state_accepts_y0() {
     let error = runtime(&[]).reset(Some(&[0.0; DIMS])).unwrap_err().to_string();
-    assert!(error.contains("does not carry its DMP state"), "{error}");
+    assert!(error.contains("do not start where"), "{error}");
     let mut carrying = runtime(CARRY);
     let at_rest = carrying.segment(&observation(0.0)).unwrap().to_vec();
     carrying.reset(Some(&[0.5, -0.5])).unwrap();

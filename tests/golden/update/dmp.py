@@ -57,7 +57,7 @@ def starts(settings, observations):
     if settings.start == "zero":
         zero = observations.new_zeros(len(observations), dims)
         return zero, zero
-    if settings.start == "carry":
+    if settings.start in ("carry", "action"):
         at = settings.observation_len
         return observations[:, at : at + dims], observations[:, at + dims : at + 2 * dims]
     # DMP time runs 1 per segment, the robot's K control steps.

@@ -51,6 +51,7 @@ VARIANTS = {
     "mlp": dict(policy="mlp"),
     "chunk": dict(policy="chunk"),
     "dmp_carry": dict(start="carry"),
+    "dmp_action": dict(start="action", controller="direct"),
     "dmp_first": dict(critic="first"),
     "dmp_observed": dict(start="observed"),
     "dmp_observed_at_rest": dict(start="observed", start_velocity="zero"),
@@ -61,7 +62,7 @@ VARIANTS = {
 CASES = {
     "ddpg": list(VARIANTS),
     "td3": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_first"],
-    "sac": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_first"],
+    "sac": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_action", "dmp_first"],
     "tqc": ["dmp", "mlp", "chunk", "dmp_carry"],
 }
 

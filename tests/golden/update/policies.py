@@ -27,7 +27,7 @@ class MlpPolicy(nn.Module):
 
 
 class DmpPolicy(nn.Module):
-    """A segment of K actions: DMP, then the adaptive inverse or the position controller.
+    """A segment of K actions: DMP, then the adaptive inverse, the position or no controller.
 
     Outputs of one action dimension stand together: goal, N weights, 4 rho (of the former only).
     """
@@ -59,6 +59,8 @@ class DmpPolicy(nn.Module):
         if s.controller == "position":
             before = torch.cat([y0[:, None], y[:, :-1]], dim=1)
             return s.position_scale * (y - before), outputs[:, :0], outputs[:, :0]
+        if s.controller == "direct":
+            return y, outputs[:, :0], outputs[:, self.outputs :]
         yd, ydd = yd / s.omega, ydd / s.omega**2
         rho = rho[:, None]  # (B, 1, A, 4): the same over the K steps
         pre = (1 + rho[..., 0]) * y + rho[..., 1] * yd + rho[..., 2] * ydd + rho[..., 3]

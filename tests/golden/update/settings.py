@@ -65,13 +65,14 @@ class Settings:
 
     @property
     def carries(self):
-        """Whether (y, yd) belong to the observation."""
+        """Whether the DMP's (y, yd) belong to the observation."""
         return self.policy == "dmp" and self.start == "carry"
 
     @property
     def policy_observation_len(self):
-        """O, a carried state included."""
-        return self.observation_len + (2 * self.action_len if self.carries else 0)
+        """O, with the state of the DMP or of the last actions."""
+        has_state = self.carries or self.start == "action"
+        return self.observation_len + (2 * self.action_len if has_state else 0)
 
     @property
     def critic_action_len(self):

@@ -44,6 +44,14 @@ fn a_dmp_that_carries_its_state_on_trains() {
     trains("reacher", &carry);
 }
 
+#[test]
+fn segments_that_start_at_the_last_action_train() {
+    let action = ["--set", "policy.start=action", "--set", "policy.controller=direct"];
+    trains("pusher", &action);
+    trains("panda-push", &action);
+    trains("reacher", &["--policy", "chunk", "--set", "policy.start=action"]);
+}
+
 /// On-policy: the number of its segments is not bounded, and some are stale.
 #[test]
 fn neural_dynamic_policies_train() {

@@ -10,7 +10,7 @@
 
 use anyhow::Context;
 use dmprl_shared::config::{Controller, ForcingScaling, RhoKind, StartSource};
-use dmprl_shared::policy::{Head, PolicyDescription};
+use dmprl_shared::policy::{CommandState, Head, PolicyDescription};
 use dmprl_shared::policy_file::OpenedPolicy;
 use prost::Message;
 
@@ -85,13 +85,12 @@ impl<'a> PolicyGraph<'a> {
     }
 
     fn build(mut self) -> Graph {
-        let carries = self.opened.policy.carries_state();
         let about = "(batch, O), in the environment's units";
         let len = self.description.spec.observation_len;
         let observation = self.graph.input("observation", len, about);
-        let state = carries.then(|| {
-            let about = "(batch, 2A): initial y, then yd, of the movement primitive; zeros at the \
-                         start of an episode, then the previous next_state";
+        let state = (self.opened.policy.state_len() > 0).then(|| {
+            let about = "(batch, 2A): y, then yd, at the start of the segment; zeros at the start \
+                         of an episode, then the previous next_state";
             self.graph.input("state", 2 * self.dims, about)
         });
         let network_input = match &state {
@@ -106,6 +105,9 @@ impl<'a> PolicyGraph<'a> {
             }
             Head::Dmp(_) => self.segment(&outputs, &observation, state.as_deref()),
         };
+        if let (Some(_), Some(state)) = (self.opened.policy.command_state(), &state) {
+            self.next_command_state(&u, state);
+        }
         self.scale_actions(&u);
         self.graph
     }
@@ -154,7 +156,7 @@ impl<'a> PolicyGraph<'a> {
             (0..columns * rows).map(|at| map.matrix()[(at % rows) * columns + at / rows]).collect();
         let transposed = graph.constant(&[columns, rows], &transposed);
         let samples = graph.op("MatMul", &[&inputs, &transposed]);
-        if state.is_some() {
+        if self.opened.policy.carries_dmp_state() {
             self.next_state(&samples, head.omega());
         }
         let graph = &mut self.graph;
@@ -167,6 +169,7 @@ impl<'a> PolicyGraph<'a> {
                 let scale = graph.scalar(policy.position_scale as f32);
                 graph.op("Mul", &[&moved, &scale])
             }
+            Controller::Direct => graph.op("Tanh", &[&y]),
             Controller::Inverse => {
                 let bounded = policy.rho == RhoKind::Bounded;
                 let source = if bounded { &squashed } else { &raw };
@@ -198,6 +201,34 @@ impl<'a> PolicyGraph<'a> {
         graph.op("Tanh", &[&sum])
     }
 
+    /// Adds the output of the state after actions u, (batch, K, A), as `CommandState` computes it.
+    fn next_command_state(&mut self, u: &str, state: &str) {
+        let (graph, steps, dims) = (&mut self.graph, self.steps, self.dims as i64);
+        let [least, most] = [-1.0, 1.0].map(|sign| graph.scalar(sign * CommandState::U_MAX));
+        let clipped = graph.op("Clip", &[u, &least, &most]);
+        // tanh⁻¹(u) = log((1 + u) / (1 - u)) / 2; ONNX's Atanh is missing in small runtimes.
+        let [one, half] = [1.0, 0.5].map(|number| graph.scalar(number));
+        let above = graph.op("Add", &[&one, &clipped]);
+        let below = graph.op("Sub", &[&one, &clipped]);
+        let ratio = graph.op("Div", &[&above, &below]);
+        let ratio = graph.op("Log", &[&ratio]);
+        let y = graph.op("Mul", &[&ratio, &half]);
+        let last = graph.slice(&y, 1, steps - 1, steps);
+        let last = graph.reshape(&last, &[-1, dims]);
+        let before = if steps == 1 {
+            graph.slice(state, 1, 0, self.dims)
+        } else {
+            let before = graph.slice(&y, 1, steps - 2, steps - 1);
+            graph.reshape(&before, &[-1, dims])
+        };
+        let per_segment = graph.scalar(steps as f32);
+        let moved = graph.op("Sub", &[&last, &before]);
+        let yd = graph.op("Mul", &[&moved, &per_segment]);
+        let state = graph.concat(&[&last, &yd], 1);
+        let about = "(batch, 2A): state for the next decision";
+        graph.output(&state, "next_state", &[2 * self.dims], about);
+    }
+
     /// Adds the output (y_K, yd_K), (batch, 2A). The samples' velocities are in units of omega.
     fn next_state(&mut self, samples: &str, omega: f32) {
         let (graph, steps, dims) = (&mut self.graph, self.steps, self.dims as i64);
@@ -215,7 +246,7 @@ impl<'a> PolicyGraph<'a> {
     fn start(&mut self, goal: &str, observation: &str, state: Option<&str>) -> Start {
         use dmprl_shared::config::Start as Kind;
         match (self.description.policy.start, state) {
-            (Kind::Carry, Some(state)) => {
+            (Kind::Carry | Kind::Action, Some(state)) => {
                 let (graph, dims) = (&mut self.graph, self.dims);
                 let parts = [0..dims, dims..2 * dims].map(|part| {
                     let part = graph.slice(state, 1, part.start, part.end);

@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, bail, ensure};
 use clap::ValueEnum;
 use dmprl_run::Watch;
-use dmprl_shared::config::{ExperimentConfig, RhoKind};
+use dmprl_shared::config::{Controller, ExperimentConfig, RhoKind};
 use dmprl_shared::spec::EnvSpec;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -117,6 +117,11 @@ fn unsupported(config: &ExperimentConfig) -> Option<&'static str> {
             "tests/peers updates TD3's actor at every second update",
         ),
         (config.policy.rho == RhoKind::Free, "tests/peers has only a bounded rho"),
+        (config.policy.follows_actions(), "tests/peers has no policy.start = \"action\""),
+        (
+            config.policy.controller == Controller::Direct,
+            "tests/peers has no policy.controller = \"direct\"",
+        ),
         (algorithm.action_rate_penalty > 0.0, "tests/peers has no action rate penalty"),
     ];
     differences.into_iter().find_map(|(differs, why)| differs.then_some(why))

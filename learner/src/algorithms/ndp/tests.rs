@@ -143,6 +143,7 @@ impl Case {
             Tensor::cat(&[&y0, &y0.zeros_like()?, &goal, &weights], 1)?.matmul(&matrix.t()?)?;
         let y = samples.narrow(1, 0, k)?;
         let u = match self.config.policy.controller {
+            Controller::Direct => y.tanh()?,
             Controller::Position => {
                 let before = Tensor::cat(&[&y0, &y.narrow(1, 0, k - 1)?], 1)?;
                 ((y - before)? * self.config.policy.position_scale)?

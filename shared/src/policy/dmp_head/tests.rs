@@ -30,7 +30,7 @@ fn head(keys: &[(&str, &str)]) -> DmpHead {
 }
 
 #[test]
-fn gradients_of_both_controllers_equal_central_differences() {
+fn gradients_of_all_controllers_equal_central_differences() {
     let observed = ("policy.start", "observed");
     let position = ("policy.controller", "position");
     let goal = ("dmp.forcing_scaling", "goal");
@@ -39,6 +39,7 @@ fn gradients_of_both_controllers_equal_central_differences() {
         &[observed, goal],
         &[position, ("policy.position_scale", "3.0")],
         &[position, observed, goal, ("dmp.integrator", "explicit")],
+        &[("policy.controller", "direct"), observed],
     ] {
         let head = head(keys);
         let len = head.outputs_len();
