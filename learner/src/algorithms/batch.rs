@@ -106,9 +106,10 @@ pub struct Batch {
     pub next_noise: Vec<f32>,
     /// Standard normal noise for the actor's own actions, (B, K A), or empty.
     pub noise: Vec<f32>,
-    /// u_{t-1}, (B, A), if it exists. Filled only with `algorithm.action_rate_penalty`.
+    /// u_{t-2} and u_{t-1}, (B, 2, A), if they exist. Filled only with a penalty on their changes.
     pub previous_actions: Vec<f32>,
-    /// 1 if u_{t-1} exists, 0 if the episode began or the replay no longer has it, (B,).
+    /// 1 if u_{t-2}, and u_{t-1}, exist, 0 if the episode began later or the replay no longer has
+    /// them, (B, 2). The second is 1 where the first is.
     pub has_previous: Vec<f32>,
     /// How each step of the window moves the achieved goal, for the outcome model, (B, K G).
     pub motion: Vec<f32>,
@@ -175,8 +176,8 @@ impl Batch {
             next_inputs: vec![0.0; shape.rows * shape.observation_len],
             next_noise: noise(shape.next_noise),
             noise: noise(shape.noise),
-            previous_actions: vec![0.0; shape.rows * shape.action_len],
-            has_previous: vec![0.0; shape.rows],
+            previous_actions: vec![0.0; shape.rows * 2 * shape.action_len],
+            has_previous: vec![0.0; shape.rows * 2],
             motion: vec![0.0; shape.rows * shape.outcome.map_or(0, OutcomeShape::outputs)],
             target_range: [f32::NEG_INFINITY, f32::INFINITY],
             actions: vec![0.0; shape.segment_actions_len],
@@ -293,12 +294,12 @@ impl Batch {
         let first = row * shape.critic_inputs() + shape.observation_len;
         self.critic_inputs[first..first + shape.actions_len]
             .copy_from_slice(&self.actions[..shape.actions_len]);
-        if config.action_rate_penalty > 0.0 {
-            let previous = replay.previous_action(window);
-            self.has_previous[row] = f32::from(u8::from(previous.is_some()));
-            if let Some(previous) = previous {
-                let a = shape.action_len;
-                self.previous_actions[row * a..(row + 1) * a].copy_from_slice(previous);
+        if config.action_rate_penalty + config.action_acceleration_penalty > 0.0 {
+            for (index, previous) in replay.previous_actions(window).into_iter().enumerate() {
+                let at = 2 * row + index;
+                self.has_previous[at] = f32::from(u8::from(previous.is_some()));
+                let out = self.previous_actions.chunks_exact_mut(shape.action_len).nth(at);
+                previous.zip(out).into_iter().for_each(|(from, out)| out.copy_from_slice(from));
             }
         }
     }
@@ -415,7 +416,7 @@ mod tests {
 
     #[test]
     fn a_price_on_changes_asks_for_the_actions_before_the_windows() {
-        let config = AlgorithmConfig { action_rate_penalty: 1.0, ..AlgorithmConfig::default() };
+        let config = AlgorithmConfig { action_acceleration_penalty: 1.0, ..Default::default() };
         let replay = replay(9, &[(0, TERMINATED)]);
         let mut sampler = Sampler::new(Windows::Sliding, dmprl_shared::seeds::stream(1, "test", 0));
         let mut batch = Batch::new(SHAPE);
@@ -429,9 +430,11 @@ mod tests {
         let mut seen = [false; 3];
         for row in 0..SHAPE.rows {
             let step = batch.observations[row] as usize;
-            let expected = if step == 0 { 0.0 } else { 0.1 * step as f32 };
-            assert_eq!(batch.has_previous[row] * batch.previous_actions[row], expected);
-            assert_eq!(batch.has_previous[row], f32::from(u8::from(step > 0)));
+            for (before, at) in [(2, 2 * row), (1, 2 * row + 1)] {
+                let expected = if step < before { 0.0 } else { 0.1 * (step + 1 - before) as f32 };
+                assert_eq!(batch.has_previous[at] * batch.previous_actions[at], expected);
+                assert_eq!(batch.has_previous[at], f32::from(u8::from(step >= before)));
+            }
             seen[step] = true;
         }
         assert_eq!(seen, [true; 3]);

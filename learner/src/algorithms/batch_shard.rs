@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use dmprl_shared::policy::{Activations, Head, HeadGradient, MlpShape, Policy, PolicyWorkspace};
 
+use super::action_penalties::{ActionPenalties, ActionRow};
 use super::batch::States;
 use super::outcome::OutcomeBuffers;
 use super::{Batch, BatchShape};
@@ -49,15 +50,6 @@ pub struct LossSums {
     pub actor: f32,
     /// log pi of the actions that the actor drew.
     pub log_density: f32,
-}
-
-/// The penalty on action changes, with the batch that has the previous actions.
-#[derive(Debug, Clone, Copy)]
-pub struct ActionRate<'a> {
-    /// Weight of a squared change, in units of Q.
-    pub penalty: f32,
-    /// The batch that the policy acts on.
-    pub batch: &'a Batch,
 }
 
 /// Some rows of a batch, with all buffers of an update.
@@ -279,7 +271,7 @@ impl BatchShard {
         }
     }
 
-    /// Runs the backward passes of the loss -mean Q of one critic, plus the penalty on action
+    /// Runs the backward passes of the loss -mean Q of one critic, plus the penalties on action
     /// changes. Call it after [`BatchShard::act`] and [`BatchShard::evaluate_critics`].
     pub fn deterministic_policy_gradient(
         &mut self,
@@ -287,13 +279,14 @@ impl BatchShard {
         actor: &NetworkView<'_>,
         critic: &[NetworkView<'_>; 1],
         outcome_model: Option<&NetworkView<'_>>,
-        rate: ActionRate<'_>,
+        penalties: ActionPenalties,
+        batch: &Batch,
     ) {
         self.sums = LossSums { actor: -self.q(0).iter().sum::<f32>(), ..LossSums::default() };
         let weight = -1.0 / self.batch_rows;
         self.actions_gradient(critic, outcome_model, |_, _, _| weight);
         self.unsquash();
-        self.penalise(policy, rate);
+        self.penalise(policy, penalties, batch);
         self.log_stds_backward(policy, |_, _, _| 0.0);
         self.actor_backward(policy, actor);
     }
@@ -345,33 +338,25 @@ impl BatchShard {
         }
     }
 
-    /// Adds the penalty on changes of tanh(means) to the actor's loss and its gradient. Call it
+    /// Adds the penalties on changes of tanh(means) to the actor's loss and its gradient. Call it
     /// after [`BatchShard::unsquash`]. Sets the actions to tanh(means).
-    pub fn penalise(&mut self, policy: &Policy, rate: ActionRate<'_>) {
-        let ActionRate { penalty, batch } = rate;
-        if penalty == 0.0 {
+    pub fn penalise(&mut self, policy: &Policy, penalties: ActionPenalties, batch: &Batch) {
+        if penalties.is_none() {
             return;
         }
         let BatchShape { action_len: dims, segment_actions_len: len, .. } = self.shape;
         policy.bound_means(&mut self.policy, self.rows.len() * len);
-        let factor = 2.0 * penalty / self.batch_rows;
         for row in 0..self.rows_len() {
             let at = self.rows.start + row;
             let actions = &self.policy.actions[row * len..(row + 1) * len];
             let gradient = &mut self.actions_gradient[row * len..(row + 1) * len];
-            let slope = |i: usize| factor * (1.0 - actions[i] * actions[i]);
-            let previous = &batch.previous_actions[at * dims..(at + 1) * dims];
-            for (d, previous) in previous.iter().enumerate() {
-                let change = batch.has_previous[at] * (actions[d] - previous);
-                gradient[d] += slope(d) * change;
-                self.sums.actor += penalty * change * change;
-            }
-            for i in dims..len {
-                let change = actions[i] - actions[i - dims];
-                gradient[i] += slope(i) * change;
-                gradient[i - dims] -= slope(i - dims) * change;
-                self.sums.actor += penalty * change * change;
-            }
+            let row = ActionRow {
+                actions,
+                previous: &batch.previous_actions[2 * at * dims..2 * (at + 1) * dims],
+                has_previous: [batch.has_previous[2 * at], batch.has_previous[2 * at + 1]],
+            };
+            let slope = |i: usize| (1.0 - actions[i] * actions[i]) / self.batch_rows;
+            self.sums.actor += penalties.add(row, gradient, slope);
         }
     }
 

@@ -22,7 +22,8 @@
 //! 9. Two updates per segment; 3 000 warm-up steps within 0.3 of the range; 8 environments per
 //!    worker.
 //! 10. Tasks have their own defaults (`shared/src/config/tasks.rs`).
-//! 11. The actor's loss has a penalty on action changes (`action_rate_penalty`).
+//! 11. The actor's loss has penalties on action changes (`action_rate_penalty` and
+//!     `action_acceleration_penalty`).
 //! 12. rho stays within `rho_range` of (1, 0, 0, 0), because the paper does not specify it. This
 //!     also holds for `paper`.
 //! 13. With `outcome_model` the critic also sees predicted outcomes of the segment (`outcome.rs`).
@@ -31,7 +32,8 @@ use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::Policy;
 
-use super::batch_shard::{ActionRate, BatchShard, outcome_step, shards, total};
+use super::action_penalties::ActionPenalties;
+use super::batch_shard::{BatchShard, outcome_step, shards, total};
 use super::outcome::new_outcome_model;
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::network::TrainableNetwork;
@@ -47,7 +49,7 @@ pub struct Ddpg {
     /// Predicts the outcomes that the critics see, if configured.
     pub outcome_model: Option<TrainableNetwork>,
     polyak: f32,
-    action_rate_penalty: f32,
+    penalties: ActionPenalties,
     pub(super) shards: Vec<BatchShard>,
 }
 
@@ -63,8 +65,8 @@ impl Ddpg {
         let outcome_model = new_outcome_model(config, shape)?;
         let critics = std::slice::from_ref(&critic);
         let shards = shards(policy, shape, critics, outcome_model.as_ref());
-        let action_rate_penalty = config.algorithm.action_rate_penalty as f32;
-        Ok(Self { shards, actor, critic, outcome_model, polyak, action_rate_penalty })
+        let penalties = ActionPenalties::new(&config.algorithm);
+        Ok(Self { shards, actor, critic, outcome_model, polyak, penalties })
     }
 
     /// Updates critic, actor and both targets.
@@ -81,7 +83,7 @@ impl Ddpg {
         self.critic_step(policy, batch, pool)?;
         let critic = total(&self.shards);
         let rows = batch.rewards.len() as f32;
-        self.actor_step(policy, batch, pool, self.action_rate_penalty * critic.q_size / rows);
+        self.actor_step(policy, batch, pool, self.penalties.of(critic.q_size / rows));
         let actor = total(&self.shards);
         Ok(Losses {
             critic_loss: critic.squared_error / rows,
@@ -115,21 +117,21 @@ impl Ddpg {
         Ok(())
     }
 
-    /// Does an actor step on the loss -mean Q(s, pi(s)), plus the penalty on action changes.
-    fn actor_step(&mut self, policy: &Policy, batch: &Batch, pool: &mut ThreadPool, penalty: f32) {
+    /// Does an actor step on the loss -mean Q(s, pi(s)), plus the penalties on action changes.
+    fn actor_step(
+        &mut self,
+        policy: &Policy,
+        batch: &Batch,
+        pool: &mut ThreadPool,
+        penalties: ActionPenalties,
+    ) {
         let (actor, critic) = (self.actor.view(), [self.critic.view()]);
         let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
         let model = model.as_ref();
         pool.for_each(&mut self.shards, |shard| {
             shard.act(policy, &actor, batch.states());
             shard.evaluate_critics(policy, &critic, model, batch.states());
-            shard.deterministic_policy_gradient(
-                policy,
-                &actor,
-                &critic,
-                model,
-                ActionRate { penalty, batch },
-            );
+            shard.deterministic_policy_gradient(policy, &actor, &critic, model, penalties, batch);
         });
         drop((actor, critic));
         self.actor.adam_step(

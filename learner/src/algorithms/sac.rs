@@ -15,8 +15,8 @@
 //! 3. The temperature's loss is linear in its logarithm, as in their code.
 //! 4. Squared errors without the factor one half; PyTorch's initialisation.
 //! 5. A time limit is not a termination: truncated episodes bootstrap.
-//! 6. With policy `dmp` the actor's loss has a penalty on changes of its means
-//!    (`action_rate_penalty`).
+//! 6. With policy `dmp` the actor's loss has penalties on changes of its means
+//!    (`action_rate_penalty`, `action_acceleration_penalty`).
 //! 7. Learning rates of networks come from the configuration (1e-3 instead of 3e-4); that of the
 //!    temperature is 3e-4. Two updates per segment are 0.4 per environment step instead of 1.
 //!    Observations are normalised.
@@ -26,8 +26,9 @@ use candle_core::Result;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::{Policy, gaussian};
 
+use super::action_penalties::ActionPenalties;
 use super::batch::States;
-use super::batch_shard::{ActionRate, BatchShard, LossSums, outcome_step, shards, total};
+use super::batch_shard::{BatchShard, LossSums, outcome_step, shards, total};
 use super::outcome::new_outcome_model;
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::network::{NetworkView, TrainableNetwork};
@@ -46,7 +47,7 @@ pub struct Sac {
     pub outcome_model: Option<TrainableNetwork>,
     target_entropy: f32,
     polyak: f32,
-    action_rate_penalty: f32,
+    penalties: ActionPenalties,
     pub(super) shards: Vec<BatchShard>,
 }
 
@@ -56,7 +57,7 @@ struct ActorWeights {
     /// Weight of the entropy.
     temperature: f32,
     /// Weight of the squared changes of the means.
-    penalty: f32,
+    penalties: ActionPenalties,
 }
 
 impl Sac {
@@ -82,7 +83,7 @@ impl Sac {
             target_entropy: (sac.target_entropy_per_action * shape.segment_actions_len as f64)
                 as f32,
             polyak: config.algorithm.polyak as f32,
-            action_rate_penalty: config.algorithm.action_rate_penalty as f32,
+            penalties: ActionPenalties::new(&config.algorithm),
         })
     }
 
@@ -101,8 +102,8 @@ impl Sac {
         outcome_step(&mut self.outcome_model, &mut self.shards, batch, pool);
         self.critics_step(policy, batch, pool, temperature)?;
         let critic = total(&self.shards);
-        let penalty = self.action_rate_penalty * critic.q_size / rows;
-        self.actor_step(policy, batch, pool, ActorWeights { temperature, penalty });
+        let penalties = self.penalties.of(critic.q_size / rows);
+        self.actor_step(policy, batch, pool, ActorWeights { temperature, penalties });
         let actor = total(&self.shards);
         let entropy = -actor.log_density / rows;
         // The gradient of -log temperature (mean log pi + target entropy).
@@ -153,7 +154,7 @@ impl Sac {
     }
 
     /// Does an actor step on the loss mean (temperature log pi(u|s) - min_i Q_i(s, u)), u ~ pi(s),
-    /// with the reparametrised gradient of u, plus the penalty on changes of the means.
+    /// with the reparametrised gradient of u, plus the penalties on changes of the means.
     fn actor_step(
         &mut self,
         policy: &Policy,
@@ -161,7 +162,7 @@ impl Sac {
         pool: &mut ThreadPool,
         weights: ActorWeights,
     ) {
-        let ActorWeights { temperature, penalty } = weights;
+        let ActorWeights { temperature, penalties } = weights;
         let [first, second] = &self.critics;
         let (actor, critics) = (self.actor.view(), [first.view(), second.view()]);
         let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
@@ -196,8 +197,9 @@ impl Sac {
                 let gradient = shard.actions_gradient[at] * drawn.shift - share;
                 if drawn.in_range { gradient } else { 0.0 }
             });
-            // The penalty is on the means, which act without exploration: noise need not be smooth.
-            shard.penalise(policy, ActionRate { penalty, batch });
+            // The penalties are on the means, which act without exploration, whose noise need not
+            // be smooth.
+            shard.penalise(policy, penalties, batch);
             shard.actor_backward(policy, &actor);
         });
         drop((actor, critics));

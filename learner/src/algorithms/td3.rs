@@ -10,7 +10,8 @@
 //! 3. Layers have 256 and 256 units instead of 400 and 300; a batch has 256 rows instead of 100.
 //! 4. Two updates per segment are 0.4 per environment step instead of 1. Observations are
 //!    normalised. Warm-up actions come from a part of the range (`exploration.warm_up_range`).
-//! 5. With policy `dmp` the actor's loss has a penalty on action changes (`action_rate_penalty`).
+//! 5. With policy `dmp` the actor's loss has penalties on action changes (`action_rate_penalty`
+//!    and `action_acceleration_penalty`).
 //! 6. A time limit is not a termination: truncated episodes bootstrap, as in their code.
 //! 7. The larger value of the two target critics may have a weight, too (`target_smaller_weight`),
 //!    as in Fujimoto et al. 2019, "Off-policy deep reinforcement learning without exploration".
@@ -20,7 +21,8 @@ use candle_core::Result;
 use dmprl_shared::config::{ExperimentConfig, Td3Config};
 use dmprl_shared::policy::Policy;
 
-use super::batch_shard::{ActionRate, BatchShard, outcome_step, shards, total};
+use super::action_penalties::ActionPenalties;
+use super::batch_shard::{BatchShard, outcome_step, shards, total};
 use super::outcome::new_outcome_model;
 use super::{Batch, BatchShape, Losses, new_actor, new_critic};
 use crate::update::network::TrainableNetwork;
@@ -37,7 +39,7 @@ pub struct Td3 {
     /// Predicts the outcomes that the critics see, if configured.
     pub outcome_model: Option<TrainableNetwork>,
     polyak: f32,
-    action_rate_penalty: f32,
+    penalties: ActionPenalties,
     pub(super) shards: Vec<BatchShard>,
 }
 
@@ -59,7 +61,7 @@ impl Td3 {
             critics,
             config: config.algorithm.td3.clone(),
             polyak: config.algorithm.polyak as f32,
-            action_rate_penalty: config.algorithm.action_rate_penalty as f32,
+            penalties: ActionPenalties::new(&config.algorithm),
         })
     }
 
@@ -86,8 +88,8 @@ impl Td3 {
             ..Losses::default()
         };
         if updates_actor {
-            let penalty = self.action_rate_penalty * critic.q_size / rows;
-            self.actor_step(policy, batch, pool, penalty);
+            let penalties = self.penalties.of(critic.q_size / rows);
+            self.actor_step(policy, batch, pool, penalties);
             losses.actor_loss = Some(total(&self.shards).actor / rows);
         }
         Ok(losses)
@@ -131,21 +133,21 @@ impl Td3 {
         Ok(())
     }
 
-    /// Does an actor step on the loss -mean Q_1(s, pi(s)), plus the penalty on action changes.
-    fn actor_step(&mut self, policy: &Policy, batch: &Batch, pool: &mut ThreadPool, penalty: f32) {
+    /// Does an actor step on the loss -mean Q_1(s, pi(s)), plus the penalties on action changes.
+    fn actor_step(
+        &mut self,
+        policy: &Policy,
+        batch: &Batch,
+        pool: &mut ThreadPool,
+        penalties: ActionPenalties,
+    ) {
         let (actor, critic) = (self.actor.view(), [self.critics[0].view()]);
         let model = self.outcome_model.as_ref().map(TrainableNetwork::view);
         let model = model.as_ref();
         pool.for_each(&mut self.shards, |shard| {
             shard.act(policy, &actor, batch.states());
             shard.evaluate_critics(policy, &critic, model, batch.states());
-            shard.deterministic_policy_gradient(
-                policy,
-                &actor,
-                &critic,
-                model,
-                ActionRate { penalty, batch },
-            );
+            shard.deterministic_policy_gradient(policy, &actor, &critic, model, penalties, batch);
         });
         drop((actor, critic));
         self.actor.adam_step(

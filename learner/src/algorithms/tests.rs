@@ -63,7 +63,10 @@ fn case_with(keys: &[(&str, &str)], rule: Option<GoalRule>) -> Case {
     fill(&mut batch.noise);
     fill(&mut batch.previous_actions);
     fill(&mut batch.motion);
-    batch.has_previous.iter_mut().step_by(3).for_each(|has| *has = 1.0);
+    // Rows with no, one and two actions before them.
+    for (row, has) in batch.has_previous.chunks_exact_mut(2).enumerate() {
+        has.copy_from_slice([&[0.0, 0.0], &[0.0, 1.0], &[1.0, 1.0]][row % 3]);
+    }
     Case { config, rule, policy, algorithm, batch }
 }
 
@@ -120,7 +123,7 @@ fn assert_within(tolerance: f64, name: &str, got: &[f32], expected: &[f32]) {
 
 #[test]
 fn an_update_equals_automatic_differentiation() {
-    let cases: [&[(&str, &str)]; 16] = [
+    let cases: [&[(&str, &str)]; 20] = [
         &[],
         &[("policy.kind", "mlp")],
         &[("policy.kind", "chunk")],
@@ -137,6 +140,10 @@ fn an_update_equals_automatic_differentiation() {
         &[("algorithm.action_rate_penalty", "0.7"), ("policy.kind", "mlp")],
         &[("algorithm.action_rate_penalty", "0.7"), ("policy.kind", "chunk")],
         &[("algorithm.action_rate_penalty", "0.7"), ("policy.start", "carry")],
+        &[("algorithm.action_acceleration_penalty", "0.7")],
+        &[("algorithm.action_acceleration_penalty", "0.7"), ("policy.kind", "mlp")],
+        &[("policy.start", "action"), ("policy.controller", "direct")],
+        &[("policy.start", "action"), ("algorithm.action_acceleration_penalty", "0.3")],
     ];
     for algorithm in ["ddpg", "td3", "sac"] {
         for keys in cases {

@@ -20,7 +20,7 @@ use std::fmt::Debug;
 
 use candle_core::{D, Device, Module, Result, Tensor};
 use candle_nn::VarBuilder;
-use dmprl_shared::config::{AlgorithmName, ExperimentConfig};
+use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, ExperimentConfig};
 use dmprl_shared::policy::Policy;
 
 use crate::algorithms::batch::{Batch, BatchShape};
@@ -268,7 +268,7 @@ impl Graph {
         Ok(CriticLosses { critic_loss: sum, q_mean, q_size })
     }
 
-    /// Does an actor step on -Q(s, pi(s)) of one critic, plus the penalty on changes of actions,
+    /// Does an actor step on -Q(s, pi(s)) of one critic, plus the penalties on changes of actions,
     /// and moves the actor's target. Returns the loss.
     fn policy_gradient_step(
         &mut self,
@@ -280,24 +280,46 @@ impl Graph {
         let u = means.means.tanh()?;
         let inputs = self.critic_inputs(&batch.states, &means.with_end_state(&u)?)?;
         let q = self.forward(critic, Of::Frozen, &inputs)?.mean_all()?;
-        let loss = (self.action_rate_penalty(&u, batch, q_size)? - q)?;
+        let loss = (self.action_penalties(&u, batch, q_size)? - q)?;
         self.descend("actor", &loss, true)?;
         loss.to_scalar()
     }
 
-    /// Returns the penalty on changes of the actions u, (B, K A): the sum of their squares, as a
-    /// mean over the batch and a share of |Q|.
-    fn action_rate_penalty(&self, u: &Tensor, batch: &DeviceBatch, q_size: f64) -> Result<Tensor> {
-        let BatchShape { action_len, segment_actions_len, .. } = self.shape;
-        let first = (u.narrow(1, 0, action_len)? - &batch.previous_actions)?;
-        let mut changes = first.broadcast_mul(&batch.has_previous)?;
-        let len = segment_actions_len - action_len;
-        if len > 0 {
-            let others = (u.narrow(1, action_len, len)? - u.narrow(1, 0, len)?)?;
-            changes = Tensor::cat(&[&changes, &others], 1)?;
+    /// Returns the penalties on changes of the actions u, (B, K A), on their rate and on their
+    /// acceleration: sums of squares, as means over the batch and shares of |Q|.
+    fn action_penalties(&self, u: &Tensor, batch: &DeviceBatch, q_size: f64) -> Result<Tensor> {
+        let dims = self.shape.action_len;
+        let changes_of = |x: &Tensor| {
+            let len = x.dim(1)? - dims;
+            x.narrow(1, dims, len)? - x.narrow(1, 0, len)?
+        };
+        // 0 for changes that involve an action that does not exist.
+        let masked = |changes: &Tensor, masks: &[usize]| {
+            let mut parts = Vec::new();
+            for (k, column) in masks.iter().enumerate() {
+                let has = batch.has_previous.narrow(1, *column, 1)?;
+                if k * dims < changes.dim(1)? {
+                    parts.push(changes.narrow(1, k * dims, dims)?.broadcast_mul(&has)?);
+                }
+            }
+            let from = parts.len() * dims;
+            parts.push(changes.narrow(1, from, changes.dim(1)? - from)?);
+            Tensor::cat(&parts, 1)?.sqr()?.sum(1)?.mean_all()
+        };
+        let changes = changes_of(&Tensor::cat(&[&batch.previous_actions, u], 1)?)?;
+        let AlgorithmConfig { action_rate_penalty, action_acceleration_penalty, .. } =
+            self.config.algorithm;
+        let mut sum = Tensor::zeros((), u.dtype(), u.device())?;
+        if action_rate_penalty > 0.0 {
+            // The first change is before the decision.
+            let own = changes.narrow(1, dims, changes.dim(1)? - dims)?;
+            sum = (sum + (masked(&own, &[1])? * (action_rate_penalty * q_size))?)?;
         }
-        let weight = self.config.algorithm.action_rate_penalty * q_size;
-        changes.sqr()?.sum(1)?.mean_all()? * weight
+        if action_acceleration_penalty > 0.0 {
+            let own = changes_of(&changes)?;
+            sum = (sum + (masked(&own, &[0, 1])? * (action_acceleration_penalty * q_size))?)?;
+        }
+        Ok(sum)
     }
 
     /// Does one step of Adam of network `name` on `loss`. With `moves_target`, it also moves the

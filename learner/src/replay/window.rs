@@ -120,23 +120,29 @@ impl Replay {
         out[first.len() + second.len()..].fill(0.0);
     }
 
-    /// Returns the action before the window's first, (A,), or `None` if the episode began there or
-    /// the replay no longer has the segment.
+    /// Returns the two actions before the window's first, u_{t-2} and u_{t-1}, (A,) each, or `None`
+    /// where the episode began later or the replay no longer has the segment. Without u_{t-1} there
+    /// is no u_{t-2} either.
     #[must_use]
-    pub fn previous_action(&self, window: &Window) -> Option<&[f32]> {
-        let dims = self.layout.action_len;
-        let (slot, step) = match usize::from(window.offset).checked_sub(1) {
-            Some(step) => (window.slot, step),
-            None => {
-                let previous = self.slots[window.slot as usize].previous;
-                let before = self.slots.get(previous as usize)?;
-                // A slot that has been replaced since does not continue here.
-                (before.next == window.slot)
-                    .then(|| (previous, usize::from(before.steps_len).saturating_sub(1)))?
-            }
-        };
-        let (_, actions, _) = self.layout.split(self.block(slot as usize));
-        Some(&actions[step * dims..(step + 1) * dims])
+    pub fn previous_actions(&self, window: &Window) -> [Option<&[f32]>; 2] {
+        let last = self.step_before(window.slot, window.offset.into());
+        let last_but_one = last.and_then(|(slot, step)| self.step_before(slot, step));
+        [last_but_one, last].map(|at| {
+            let (slot, step) = at?;
+            let (_, actions, _) = self.layout.split(self.block(slot as usize));
+            actions.chunks_exact(self.layout.action_len).nth(step)
+        })
+    }
+
+    /// Returns slot and step before those of a step in the same episode.
+    fn step_before(&self, slot: u32, step: usize) -> Option<(u32, usize)> {
+        if let Some(step) = step.checked_sub(1) {
+            return Some((slot, step));
+        }
+        let previous = self.slots[slot as usize].previous;
+        let before = self.slots.get(previous as usize)?;
+        // A slot that has been replaced since does not continue here.
+        (before.next == slot).then(|| (previous, usize::from(before.steps_len).saturating_sub(1)))
     }
 
     /// Returns the sum of discount^i r_i over the window's n steps.
@@ -341,14 +347,14 @@ mod tests {
         assert_eq!(firsts, [6.0, 100.0, 101.0, 102.0, 103.0, 104.0, 105.0, 106.0]);
     }
 
-    /// Returns (observation, previous action) of every window.
-    fn previous(replay: &Replay) -> Vec<(f32, Option<f32>)> {
+    /// Returns (observation, the two previous actions) of every window.
+    fn previous(replay: &Replay) -> Vec<(f32, [Option<f32>; 2])> {
         let windows = (0..replay.len()).flat_map(|slot| (0..3).map(move |at| (slot, at)));
         let windows = windows.filter_map(|(slot, offset)| replay.window(slot, offset));
         let mut all: Vec<_> = windows
             .map(|window| {
-                let previous = replay.previous_action(&window).map(|action| action[0]);
-                (replay.observation(&window)[0], previous)
+                let previous = replay.previous_actions(&window);
+                (replay.observation(&window)[0], previous.map(|action| Some(action?[0])))
             })
             .collect();
         all.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -360,11 +366,12 @@ mod tests {
         let mut replay = Replay::new(LAYOUT, 300, 1, 1);
         episode(&mut replay, 0, 6, TERMINATED);
         episode(&mut replay, 1, 3, TRUNCATED);
-        let expected = [None, Some(0.0), Some(0.01), Some(0.02), Some(0.03), Some(0.04), None];
+        let all = [None, None, Some(0.0), Some(0.01), Some(0.02), Some(0.03), Some(0.04)];
+        let expected = all.windows(2).map(|pair| [pair[0], pair[1]]).chain([[None; 2]]);
         let (steps, actions): (Vec<_>, Vec<_>) = previous(&replay).into_iter().unzip();
         assert_eq!(
             (steps, actions),
-            ((0..6).map(|t| t as f32).chain([100.0]).collect(), expected.into())
+            ((0..6).map(|t| t as f32).chain([100.0]).collect(), expected.collect())
         );
     }
 
@@ -377,7 +384,7 @@ mod tests {
         let of = |step| previous(&replay).into_iter().find(|found| found.0 == step).unwrap().1;
         assert_eq!(
             (of(6.0), of(100.0), of(103.0), of(106.0)),
-            (None, None, Some(0.02), Some(0.05))
+            ([None; 2], [None; 2], [Some(0.01), Some(0.02)], [Some(0.04), Some(0.05)])
         );
     }
 
@@ -449,7 +456,11 @@ mod tests {
         for (slot, real) in [true, false, true, false].into_iter().enumerate() {
             let whole = replay.window(slot, 0).unwrap();
             assert_eq!(whole.len(), 3);
-            assert_eq!(replay.previous_action(&whole).is_some(), real && slot > 0, "slot {slot}");
+            assert_eq!(
+                replay.previous_actions(&whole)[1].is_some(),
+                real && slot > 0,
+                "slot {slot}"
+            );
             assert_eq!(replay.window(slot, 1).is_some(), real, "slot {slot}");
             if let Some(window) = replay.window(slot, 1) {
                 assert_eq!(window.next, slot as u32 + 2, "the segment, not the copy between");

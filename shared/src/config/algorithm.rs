@@ -112,6 +112,9 @@ pub struct AlgorithmConfig {
     /// rewards. The action before the first one is read from the replay. Larger values give
     /// smoother motion.
     pub action_rate_penalty: f64,
+    /// The same for the action acceleration: the penalty is the sum of
+    /// (u_{t+1} - 2 u_t + u_{t-1})². Actions before the first one are read from the replay.
+    pub action_acceleration_penalty: f64,
     /// Reward of a step that moves the achieved goal and leaves it in the region of desired goals
     /// and starts, in units of the reward of reaching a goal. It is added while less than half of
     /// the recent episodes move it, if goals are drawn when a batch is sampled and the reward is
@@ -220,6 +223,7 @@ impl Default for AlgorithmConfig {
             critic_hidden: vec![256, 256],
             critic_layer_norm: false,
             action_rate_penalty: 0.2,
+            action_acceleration_penalty: 0.0,
             motion_bonus: 0.0,
             outcome_model: false,
             td3: Td3Config::default(),

@@ -113,6 +113,7 @@ batch_size = 256
 critic_hidden = [256, 256]
 critic_layer_norm = false
 action_rate_penalty = 0.0
+action_acceleration_penalty = 0.0
 motion_bonus = 0.0
 outcome_model = false
 [algorithm.td3]

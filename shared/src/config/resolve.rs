@@ -76,6 +76,7 @@ impl ExperimentConfig {
         self.check_combinations()?;
         self.check_ndp()?;
         self.check_tqc()?;
+        self.check_action_penalties()?;
         self.check_backend()?;
         self.check_delivery()?;
         self.check_bridge()?;
@@ -219,7 +220,6 @@ impl ExperimentConfig {
         for (key, std) in [
             ("exploration.std", self.exploration.std),
             ("algorithm.td3.target_noise_std", self.algorithm.td3.target_noise_std),
-            ("algorithm.action_rate_penalty", self.algorithm.action_rate_penalty),
         ] {
             range(key, std, std.is_finite() && std >= 0.0, || "0 or more".into())?;
         }
@@ -424,6 +424,7 @@ mod tests {
             ("algorithm.discount", "1.5"),
             ("algorithm.polyak", "nan"),
             ("algorithm.action_rate_penalty", "-0.1"),
+            ("algorithm.action_acceleration_penalty", "inf"),
             ("replay.hindsight_share", "1.1"),
             ("replay.moved_share", "-0.1"),
             ("algorithm.motion_bonus", "-1"),

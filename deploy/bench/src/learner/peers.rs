@@ -122,7 +122,10 @@ fn unsupported(config: &ExperimentConfig) -> Option<&'static str> {
             config.policy.controller == Controller::Direct,
             "tests/peers has no policy.controller = \"direct\"",
         ),
-        (algorithm.action_rate_penalty > 0.0, "tests/peers has no action rate penalty"),
+        (
+            algorithm.action_rate_penalty + algorithm.action_acceleration_penalty > 0.0,
+            "tests/peers has no penalty on changes of actions",
+        ),
     ];
     differences.into_iter().find_map(|(differs, why)| differs.then_some(why))
 }
@@ -180,6 +183,9 @@ mod tests {
             ("algorithm.td3.actor_interval", "3"),
             ("policy.rho", "free"),
             ("algorithm.action_rate_penalty", "0.2"),
+            ("algorithm.action_acceleration_penalty", "0.2"),
+            ("policy.start", "action"),
+            ("policy.controller", "direct"),
         ] {
             assert!(with(key, value).is_some(), "{key}");
         }

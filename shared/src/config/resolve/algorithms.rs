@@ -66,16 +66,26 @@ impl ExperimentConfig {
         range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {
             "false with algorithm.name = \"ndp\"; the other algorithms support it".into()
         })?;
-        let penalty = self.algorithm.action_rate_penalty;
-        range("algorithm.action_rate_penalty", penalty, !on_policy || penalty == 0.0, || {
-            "0 with algorithm.name = \"ndp\"; the other algorithms support it".into()
-        })?;
         let position = self.policy.controller == Controller::Position;
         let dmp = self.policy.kind == PolicyKind::Dmp;
         range("policy.controller", "position", on_policy || !position || !dmp, || {
             "inverse, or algorithm.name = \"ndp\", the only algorithm that clips unbounded actions"
                 .into()
         })
+    }
+
+    pub(super) fn check_action_penalties(&self) -> Result<(), ConfigError> {
+        let on_policy = self.algorithm.name == AlgorithmName::Ndp;
+        for (key, penalty) in [
+            ("algorithm.action_rate_penalty", self.algorithm.action_rate_penalty),
+            ("algorithm.action_acceleration_penalty", self.algorithm.action_acceleration_penalty),
+        ] {
+            range(key, penalty, penalty.is_finite() && penalty >= 0.0, || "0 or more".into())?;
+            range(key, penalty, !on_policy || penalty == 0.0, || {
+                "0 with algorithm.name = \"ndp\"; the other algorithms support it".into()
+            })?;
+        }
+        Ok(())
     }
 
     pub(super) fn check_tqc(&self) -> Result<(), ConfigError> {
