@@ -12,7 +12,7 @@ use super::recorded::{RecordedEpisode, Robot};
 /// Maximum number of bytes read.
 const FILE_BYTES_MAX: u64 = 256 << 20;
 /// Version of the format; raised when the measures or their definitions change.
-pub(super) const FORMAT: u32 = 1;
+pub(super) const FORMAT: u32 = 2;
 
 /// Contents of `motion.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -37,6 +37,9 @@ pub struct Motion {
     pub action_change: Option<f64>,
     /// The same by dimension, (A,).
     pub action_change_by_dimension: Vec<Option<f64>>,
+    /// Mean |u_t - 2 u_{t-1} + u_{t-2}| over steps and action dimensions; `None` if no episode has
+    /// three steps.
+    pub action_acceleration: Option<f64>,
     /// Mean |jerk| over steps and joints [unit/s³]; `None` if joints or step duration are unknown.
     pub joint_jerk: Option<f64>,
     /// The same by joint [unit/s³], (J,); `None` for joints that are not measured.

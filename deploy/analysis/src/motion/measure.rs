@@ -6,7 +6,7 @@ use anyhow::Context;
 
 use super::file::{FORMAT, Motion};
 use super::recorded::{JointKind, RecordedEpisode, RecordingReader, Robot};
-use super::smoothness::{Mean, add_action_changes, add_jerks, sparc};
+use super::smoothness::{Mean, add_action_accelerations, add_action_changes, add_jerks, sparc};
 
 /// The policy of a recording.
 #[derive(Debug, Clone, Copy)]
@@ -51,6 +51,7 @@ pub fn measure(path: &Path, policy: RecordedPolicy) -> anyhow::Result<Motion> {
         unit: sums.unit.to_owned(),
         action_change: mean_of(&sums.action_changes),
         action_change_by_dimension: sums.action_changes.iter().map(|mean| mean.value()).collect(),
+        action_acceleration: mean_of(&sums.action_accelerations),
         joint_jerk: mean_of(&sums.jerks),
         joint_jerk_by_joint,
         sparc: sparc.value(),
@@ -68,6 +69,7 @@ struct Sums {
     measured_joints: Vec<usize>,
     returns: Vec<f64>,
     action_changes: Vec<Mean>,
+    action_accelerations: Vec<Mean>,
     jerks: Vec<Mean>,
     arc_lengths: Vec<Option<f64>>,
 }
@@ -87,6 +89,7 @@ impl Sums {
             unit: kind.unit(),
             returns: Vec::new(),
             action_changes: Vec::new(),
+            action_accelerations: Vec::new(),
             jerks: vec![Mean::default(); measured_joints.len()],
             arc_lengths: Vec::new(),
             measured_joints,
@@ -96,8 +99,11 @@ impl Sums {
     fn add(&mut self, episode: &RecordedEpisode) {
         self.returns.push(episode.return_);
         let dims = episode.actions.first().map_or(0, Vec::len);
-        self.action_changes.resize(dims.max(self.action_changes.len()), Mean::default());
+        for means in [&mut self.action_changes, &mut self.action_accelerations] {
+            means.resize(dims.max(means.len()), Mean::default());
+        }
         add_action_changes(&episode.actions, &mut self.action_changes);
+        add_action_accelerations(&episode.actions, &mut self.action_accelerations);
         if self.dt <= 0.0 || self.measured_joints.is_empty() {
             self.arc_lengths.push(None);
             return;

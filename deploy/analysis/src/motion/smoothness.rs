@@ -42,6 +42,18 @@ pub fn add_action_changes(u: &[Vec<f32>], means: &mut [Mean]) {
     }
 }
 
+/// Adds |u_t - 2 u_{t-1} + u_{t-2}| to the mean of each dimension.
+///
+/// - `u`: (T, A). `means`: (A,).
+pub fn add_action_accelerations(u: &[Vec<f32>], means: &mut [Mean]) {
+    for rows in u.windows(3) {
+        for (dimension, mean) in means.iter_mut().enumerate() {
+            let [first, second, third] = [0, 1, 2].map(|row: usize| rows[row][dimension]);
+            mean.add(f64::from((third - 2.0 * second + first).abs()));
+        }
+    }
+}
+
 /// Adds the absolute jerk of each joint to its mean. Jerk is the second difference of the velocity
 /// at the control rate, `(qd_{t+1} - 2 qd_t + qd_{t-1}) / dt²`, unfiltered.
 ///

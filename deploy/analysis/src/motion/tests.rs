@@ -59,6 +59,8 @@ fn all_episodes_are_measured_and_the_first_is_kept() {
     assert_eq!((motion.episode.seed, motion.times().len()), (7, 21));
     assert_eq!(motion.action_change_by_dimension, [Some(1.0), Some(0.0)]);
     assert_eq!(motion.action_change, Some(0.5));
+    // 0, 1, 0 in one dimension, and 0 in the other.
+    assert_eq!(motion.action_acceleration, Some(1.0));
     assert_eq!(motion.unit, "rad");
     assert_eq!(motion.joint_jerk_by_joint[0], None);
     assert!((motion.joint_jerk.unwrap() - 100.0).abs() < 1e-6, "{:?}", motion.joint_jerk);

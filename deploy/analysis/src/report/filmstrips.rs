@@ -225,7 +225,12 @@ mod tests {
         std::fs::write(report.path().join("frames/panda-reach-TD3-DMP.png"), "pixels").unwrap();
         for run in &mut results.runs {
             run.source = Source::Report(report.path().to_owned());
-            run.motion = Some(MotionMetrics { joint_jerk: None, sparc: None, rollout: None });
+            run.motion = Some(MotionMetrics {
+                action_acceleration: None,
+                joint_jerk: None,
+                sparc: None,
+                rollout: None,
+            });
         }
         let planned = plan_filmstrips(&results).unwrap();
         assert!(!needs_recording(&planned), "its directory is not available");

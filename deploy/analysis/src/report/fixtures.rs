@@ -81,7 +81,7 @@ pub(super) fn fixture_motion(jerk: f64, sparc: f64) -> MotionMetrics {
 pub(super) fn motion_of(jerk: f64, sparc: f64) -> Motion {
     let joint = |name: &str, kind| Joint { name: name.to_owned(), kind };
     Motion {
-        format: 1,
+        format: 2,
         policy_version: 1,
         env_steps: INTERVAL,
         first_seed: 1_000,
@@ -95,6 +95,7 @@ pub(super) fn motion_of(jerk: f64, sparc: f64) -> Motion {
         unit: "rad".to_owned(),
         action_change: Some(0.1),
         action_change_by_dimension: vec![Some(0.1)],
+        action_acceleration: Some(0.15),
         joint_jerk: Some(jerk),
         joint_jerk_by_joint: vec![Some(jerk), None],
         sparc: Some(sparc),

@@ -28,6 +28,8 @@ pub enum Measure {
     Success,
     /// Mean absolute change of actions between two steps.
     ActionChange,
+    /// Mean absolute second difference of actions.
+    ActionAcceleration,
     /// Mean absolute jerk of the joints.
     JointJerk,
     /// Spectral arc length of the joints' speed.
@@ -47,10 +49,11 @@ pub enum Measure {
 
 impl Measure {
     /// Measures that have a table in the report, in its order.
-    pub const TABLES: [Self; 8] = [
+    pub const TABLES: [Self; 9] = [
         Self::Return,
         Self::Success,
         Self::ActionChange,
+        Self::ActionAcceleration,
         Self::JointJerk,
         Self::Sparc,
         Self::Decisions,
@@ -65,6 +68,7 @@ impl Measure {
             Self::Return => "Average return",
             Self::Success => "Success rate",
             Self::ActionChange => "Smoothness: change of actions",
+            Self::ActionAcceleration => "Smoothness: acceleration of actions",
             Self::JointJerk => "Smoothness: joint jerk [rad/s³]",
             Self::Sparc => "Smoothness: SPARC",
             Self::Decisions => "Decisions",
@@ -90,6 +94,11 @@ impl Measure {
             Self::ActionChange => {
                 "Mean absolute change of the actions between two steps of the last evaluation, \
                  with actions scaled to [-1, 1]. Lower is smoother."
+            }
+            Self::ActionAcceleration => {
+                "Mean absolute second difference of the actions, u(t) - 2 u(t-1) + u(t-2), over \
+                 the same episodes as joint jerk, with actions scaled to [-1, 1]. Lower is \
+                 smoother."
             }
             Self::JointJerk => {
                 "Mean absolute jerk of the joints, computed from their velocities at each step, \
@@ -123,6 +132,7 @@ impl Measure {
             Self::Return | Self::Success | Self::Sparc | Self::UpdateRate => 2,
             Self::JointJerk => 1,
             Self::ActionChange => 3,
+            Self::ActionAcceleration => 4,
             Self::Decisions | Self::Updates | Self::TrainingTime | Self::StepsToThreshold => 0,
         }
     }
@@ -146,7 +156,7 @@ impl Measure {
     /// Returns true if it is measured by a rollout after training.
     #[must_use]
     pub fn is_of_motion(self) -> bool {
-        matches!(self, Self::JointJerk | Self::Sparc)
+        matches!(self, Self::ActionAcceleration | Self::JointJerk | Self::Sparc)
     }
 
     /// Returns the group of the measure.
@@ -154,7 +164,9 @@ impl Measure {
     pub fn kind(self) -> MeasureKind {
         match self {
             Self::Return | Self::Success | Self::StepsToThreshold => MeasureKind::Result,
-            Self::ActionChange | Self::JointJerk | Self::Sparc => MeasureKind::Smoothness,
+            Self::ActionChange | Self::ActionAcceleration | Self::JointJerk | Self::Sparc => {
+                MeasureKind::Smoothness
+            }
             Self::Decisions | Self::Updates | Self::TrainingTime | Self::UpdateRate => {
                 MeasureKind::Cost
             }
@@ -172,6 +184,7 @@ impl Measure {
             Self::Return => Some(last.return_mean),
             Self::Success => last.success_rate,
             Self::ActionChange => Some(last.smoothness),
+            Self::ActionAcceleration => run.motion.as_ref()?.action_acceleration,
             Self::JointJerk => run.motion.as_ref()?.joint_jerk,
             Self::Sparc => run.motion.as_ref()?.sparc,
             Self::Decisions => Some(last.segments as f64),

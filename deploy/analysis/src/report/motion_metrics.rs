@@ -1,4 +1,4 @@
-//! The part of `motion.json` that a report shows: two figures and one rollout. It is small enough
+//! The part of `motion.json` that a report shows: three figures and one rollout. It is small enough
 //! for `report-data.json`.
 
 use anyhow::ensure;
@@ -13,6 +13,9 @@ const ROUNDING: f64 = 1e4;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MotionMetrics {
+    /// Mean absolute second difference of the actions; absent in reports of older programs.
+    #[serde(default)]
+    pub action_acceleration: Option<f64>,
     /// Mean |jerk| over steps and joints [rad/s³; m/s³ for a robot without hinges].
     pub joint_jerk: Option<f64>,
     /// Spectral arc length of the joints' speed.
@@ -44,8 +47,8 @@ impl MotionMetrics {
     /// Selects the data that a report shows.
     #[must_use]
     pub fn of(motion: &Motion) -> Self {
-        let Motion { joint_jerk, sparc, .. } = *motion;
-        Self { joint_jerk, sparc, rollout: Rollout::of(motion) }
+        let Motion { action_acceleration, joint_jerk, sparc, .. } = *motion;
+        Self { action_acceleration, joint_jerk, sparc, rollout: Rollout::of(motion) }
     }
 }
 
