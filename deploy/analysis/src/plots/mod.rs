@@ -4,10 +4,12 @@ mod axes;
 mod colours;
 mod learning_curve;
 mod png;
+mod scatter;
 mod small_multiples;
 
 pub(crate) use axes::{Axes, Chart};
 pub use colours::{colour, has_colour};
 pub use learning_curve::learning_curve;
 pub(crate) use png::png;
+pub(crate) use scatter::{Bounded, Scatter, ScatterPanel, ScatterPoint};
 pub(crate) use small_multiples::{Panel, SmallMultiples};

@@ -27,6 +27,8 @@ pub struct Report {
     pub claims: PaperClaims,
     /// Learning curves.
     pub curves: Vec<Picture>,
+    /// Return against smoothness, if asked for.
+    pub pareto: Vec<Picture>,
     /// Frames of a rollout.
     pub filmstrips: Vec<Filmstrip>,
     /// Joint trajectories of a rollout.

@@ -8,8 +8,8 @@
 //!   measured motions.
 //! - Measures: `measures` and `thresholds` compute the figures of a run, `statistics` summarises
 //!   them over seeds, `provenance` counts the program versions behind them.
-//! - Comparison: `tables`, `efficiency`, `curves`, `trajectories`, `filmstrips` and `statements`
-//!   compare methods, with the elements of `layout`.
+//! - Comparison: `tables`, `efficiency`, `curves`, `pareto`, `trajectories`, `filmstrips` and
+//!   `statements` compare methods, with the elements of `layout`.
 //! - Output: `contents` combines the parts, `sections` orders them for `page` and `markdown`.
 //!   `csv_files` and `snapshot` write the data for other programs and later reports.
 //!
@@ -32,6 +32,7 @@ mod motion_metrics;
 mod overview;
 mod page;
 mod paper;
+mod pareto;
 mod provenance;
 mod results;
 mod run;
@@ -54,6 +55,7 @@ pub use layout::Picture;
 pub use measures::{Measure, MeasureKind};
 pub use motion::{UnmeasuredRun, measure_motions, unmeasured};
 pub use motion_metrics::{MotionMetrics, Rollout};
+pub use pareto::pareto;
 pub use results::Results;
 pub use run::{Origin, Run, RunKey, Source};
 pub use statements::{ClaimResult, Finding, Limits, PaperClaims, Verdict, evaluate_statements};

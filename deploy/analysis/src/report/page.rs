@@ -23,7 +23,7 @@ impl Report {
     /// # Errors
     /// A picture cannot be rendered, or a file cannot be written.
     pub fn write(&self, folder: &Path) -> anyhow::Result<()> {
-        for picture in self.curves.iter().chain(&self.trajectories) {
+        for picture in self.curves.iter().chain(&self.pareto).chain(&self.trajectories) {
             let file = |ending: &str| folder.join(format!("{}.{ending}", picture.path));
             let svg = file("svg");
             create_parent(&svg)?;

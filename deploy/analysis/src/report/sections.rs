@@ -33,6 +33,10 @@ const EFFICIENCY: &str = "Environment steps until an evaluation's mean first rea
     threshold: median over the seeds, with its 95 % interval by bootstrap (the range for fewer \
     than four seeds), and the number of finished seeds that reached it. A seed that never \
     reached it counts as infinite. The resolution is the interval between evaluations.";
+/// Explains return against smoothness.
+const PARETO: &str = "A point for each method, with bars for the bounds over the seeds (the interval \
+    with four or more seeds, else the range). The line connects the methods that no other beats in \
+    both directions.";
 /// Explains the filmstrips.
 const FRAMES: &str = "One episode after training, without exploration noise, of the best method \
     with a dmp policy and of DDPG, reset with the same seed, as in the paper's Figure 5.";
@@ -94,6 +98,11 @@ pub fn sections(report: &Report) -> Vec<Section> {
         sections.push(efficiency(report));
     }
     sections.extend(of_kind(MeasureKind::Smoothness));
+    if !report.pareto.is_empty() {
+        let mut pareto = Section::new("Return and smoothness", &[PARETO]);
+        pareto.pictures = report.pareto.clone();
+        sections.push(pareto);
+    }
     if !report.filmstrips.is_empty() {
         let mut frames = Section::new("Frames of a rollout", &[FRAMES]);
         frames.filmstrips = report.filmstrips.clone();

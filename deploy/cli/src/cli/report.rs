@@ -7,8 +7,8 @@ use anyhow::Context;
 use clap::Args;
 use dmprl_analysis::report::{
     PlannedFilmstrip, Report, Results, curves, efficiency, evaluate_statements, measure_motions,
-    missing_filmstrips, missing_trajectories, needs_recording, plan_filmstrips, read_filmstrips,
-    record_filmstrips, tables, trajectories, unmeasured,
+    missing_filmstrips, missing_trajectories, needs_recording, pareto, plan_filmstrips,
+    read_filmstrips, record_filmstrips, tables, trajectories, unmeasured,
 };
 use dmprl_run::failure::Outcome;
 use dmprl_run::format::shown;
@@ -35,6 +35,7 @@ EXAMPLES
   dmprl report runs/paper
   dmprl report runs/reacher-s1 runs/reacher-s2 runs/reacher-s3 --output report
   dmprl report runs/paper reports/of-another-machine --output reports/both
+  dmprl report runs/smoothness --pareto
   dmprl report runs/paper --no-motion --json";
 
 /// Arguments of `dmprl report`.
@@ -50,6 +51,9 @@ pub(super) struct ReportArgs {
     /// Do not roll policies out; show only motion and frames that exist already.
     #[arg(long)]
     no_motion: bool,
+    /// Also draw return against smoothness, a point for each method, with the Pareto front.
+    #[arg(long)]
+    pareto: bool,
     #[command(flatten)]
     trust: TrustArgs,
     /// Also print the tables as one JSON object on standard output.
@@ -68,6 +72,11 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     }
     results.undrawn.extend(missing_filmstrips(&filmstrips));
     results.undrawn.extend(missing_trajectories(&results));
+    let pareto = if args.pareto { pareto(&results)? } else { Vec::new() };
+    if args.pareto && pareto.is_empty() {
+        let reason = "return against smoothness: it needs two methods with finished runs of a task";
+        results.undrawn.push(reason.to_owned());
+    }
     for reason in &results.unmeasured {
         say(&format!("motion not measured: {reason}"));
     }
@@ -100,6 +109,7 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         made: rfc3339(SystemTime::now()),
         commit: dmprl_run::project::git_commit(),
         curves: curves(&results)?,
+        pareto,
         filmstrips: read_filmstrips(&filmstrips)?,
         trajectories: trajectories(&results)?,
         results,

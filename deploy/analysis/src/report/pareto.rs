@@ -1,0 +1,128 @@
+//! Draws return against smoothness, a point for each method, with the Pareto front.
+
+use anyhow::anyhow;
+use dmprl_run::safe_name;
+
+use super::layout::Picture;
+use super::measures::{Measure, MeasureKind};
+use super::results::Results;
+use super::run::Run;
+use super::statistics::Summary;
+use crate::plots::{Bounded, Scatter, ScatterPanel, ScatterPoint, colour};
+
+/// Draws a picture for each task with at least two methods of known smoothness. Its panels have the
+/// success rate on the vertical axis if the task reports it, else the return.
+///
+/// # Errors
+/// A picture cannot be drawn.
+pub fn pareto(results: &Results) -> anyhow::Result<Vec<Picture>> {
+    let mut pictures = Vec::new();
+    for task in &results.tasks {
+        let has_success = results.runs.iter().any(|run| {
+            run.task == *task && run.last().is_some_and(|row| row.success_rate.is_some())
+        });
+        let vertical = if has_success { Measure::Success } else { Measure::Return };
+        let measures = Measure::TABLES.into_iter();
+        let panels: Vec<ScatterPanel> = measures
+            .filter(|measure| measure.kind() == MeasureKind::Smoothness)
+            .map(|measure| panel(results, task, measure, vertical))
+            .filter(|panel| panel.points.len() > 1)
+            .collect();
+        if panels.is_empty() {
+            continue;
+        }
+        let title = format!("{task}: {} and smoothness", vertical.title().to_lowercase());
+        let names = results.methods.iter().enumerate();
+        let scatter = Scatter {
+            title: &title,
+            y_label: vertical.title(),
+            legend: names.map(|(index, name)| (name.as_str(), colour(index, name))).collect(),
+            panels,
+        };
+        let svg =
+            scatter.draw().map_err(|error| anyhow!("cannot draw the front of {task}: {error}"))?;
+        pictures.push(Picture { path: format!("pareto/{}", safe_name(task)), alt: title, svg });
+    }
+    Ok(pictures)
+}
+
+/// Returns the panel of a measure, with the methods that have a run of which both are known.
+fn panel(results: &Results, task: &str, measure: Measure, vertical: Measure) -> ScatterPanel {
+    let mut points = Vec::new();
+    for (index, method) in results.methods.iter().enumerate() {
+        let values = |run: &Run| Some((measure.of(run)?, vertical.of(run)?));
+        let (x, y): (Vec<_>, Vec<_>) = results.of(task, method).filter_map(values).unzip();
+        if let (Some(x), Some(y)) = (Summary::of(&x), Summary::of(&y)) {
+            points.push(ScatterPoint { colour: colour(index, method), x: x.into(), y: y.into() });
+        }
+    }
+    let places: Vec<_> = points.iter().map(|point| (point.x.value, point.y.value)).collect();
+    ScatterPanel {
+        x_label: measure.title().trim_start_matches("Smoothness: ").to_owned(),
+        points,
+        front: front(places, measure.higher_is_better()),
+    }
+}
+
+impl From<Summary> for Bounded {
+    fn from(summary: Summary) -> Self {
+        let (value, bounds) = summary.point_and_bounds();
+        Self { value, bounds }
+    }
+}
+
+/// Returns the points (x, y) that no other point beats in x and y, from the smallest x on. More y is
+/// better; more or less x, by `more_x_is_better`.
+fn front(mut points: Vec<(f64, f64)>, more_x_is_better: bool) -> Vec<(f64, f64)> {
+    let x_loss = |point: &(f64, f64)| if more_x_is_better { -point.0 } else { point.0 };
+    points.sort_by(|a, b| x_loss(a).total_cmp(&x_loss(b)).then(b.1.total_cmp(&a.1)));
+    let mut best = f64::NEG_INFINITY;
+    points.retain(|point| {
+        let is_better = point.1 > best;
+        best = best.max(point.1);
+        is_better
+    });
+    if more_x_is_better {
+        points.reverse();
+    }
+    points
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::fixtures::{FixtureRun, fixture_motion, fixture_results};
+    use super::*;
+
+    #[test]
+    fn front_has_the_points_that_no_other_beats() {
+        let points = vec![(3.0, 5.0), (1.0, 1.0), (2.0, 0.5), (2.0, 4.0), (4.0, 5.0), (1.0, 0.0)];
+        assert_eq!(front(points.clone(), false), [(1.0, 1.0), (2.0, 4.0), (3.0, 5.0)]);
+        assert_eq!(front(points, true), [(4.0, 5.0)]);
+        assert_eq!(front(vec![(-2.0, 3.0), (-1.0, 1.0)], true), [(-2.0, 3.0), (-1.0, 1.0)]);
+    }
+
+    #[test]
+    fn a_task_with_two_measured_methods_has_a_picture_and_others_have_none() {
+        let run = |task, method, reward| FixtureRun {
+            task,
+            method,
+            seed: 1,
+            rows: vec![reward],
+            ended: true,
+        };
+        let mut results = fixture_results(&[
+            run("pusher-v0", "DDPG", -40.0),
+            run("pusher-v0", "SAC", -30.0),
+            run("reacher-v1", "SAC", -5.0),
+        ]);
+        for (run, jerk) in results.runs.iter_mut().zip([3.0, 9.0, 9.0]) {
+            run.motion = Some(fixture_motion(jerk, -2.0));
+        }
+        let pictures = pareto(&results).unwrap();
+        let paths: Vec<_> = pictures.iter().map(|picture| picture.path.as_str()).collect();
+        assert_eq!(paths, ["pareto/pusher-v0"]);
+        for text in ["Average return", "joint jerk", "SPARC", "change of actions", "DDPG"] {
+            assert!(pictures[0].svg.contains(text), "{text} is missing");
+        }
+    }
+}
