@@ -71,8 +71,8 @@ impl From<Summary> for Bounded {
     }
 }
 
-/// Returns the points (x, y) that no other point beats in x and y, from the smallest x on. More y is
-/// better; more or less x, by `more_x_is_better`.
+/// Returns the points (x, y) that no other point beats in x and y, from the smallest x on. More y
+/// is better; more or less x, by `more_x_is_better`.
 fn front(mut points: Vec<(f64, f64)>, more_x_is_better: bool) -> Vec<(f64, f64)> {
     let x_loss = |point: &(f64, f64)| if more_x_is_better { -point.0 } else { point.0 };
     points.sort_by(|a, b| x_loss(a).total_cmp(&x_loss(b)).then(b.1.total_cmp(&a.1)));

@@ -34,9 +34,9 @@ const EFFICIENCY: &str = "Environment steps until an evaluation's mean first rea
     than four seeds), and the number of finished seeds that reached it. A seed that never \
     reached it counts as infinite. The resolution is the interval between evaluations.";
 /// Explains return against smoothness.
-const PARETO: &str = "A point for each method, with bars for the bounds over the seeds (the interval \
-    with four or more seeds, else the range). The line connects the methods that no other beats in \
-    both directions.";
+const PARETO: &str = "A point for each method, with bars for the bounds over the seeds (the \
+    interval with four or more seeds, else the range). The line connects the methods that no other \
+    beats in both directions.";
 /// Explains the filmstrips.
 const FRAMES: &str = "One episode after training, without exploration noise, of the best method \
     with a dmp policy and of DDPG, reset with the same seed, as in the paper's Figure 5.";
