@@ -83,9 +83,9 @@ impl GraphAlgorithm for Tqc {
                 losses.q_mean = q.mean_all()?.to_scalar()?;
                 q_size = f64::from(q.abs()?.mean_all()?.to_scalar::<f32>()?);
             }
-            let loss = quantile_loss(&quantiles, &targets)?;
-            losses.critic_loss += loss.to_scalar::<f32>()?;
-            graph.descend(name, &loss, true)?;
+            let (loss, descended) = quantile_loss(&quantiles, &targets)?;
+            losses.critic_loss += loss;
+            graph.descend(name, &descended, true)?;
         }
 
         graph.soft_actor_step(batch, q_size, &mut losses, |graph, inputs| {
@@ -126,16 +126,22 @@ fn critic(context: &Context<'_>, builder: &VarBuilder<'_>) -> Result<Box<dyn Mod
 
 /// The quantile Huber loss (eq. 8) of quantiles, (B, M), with targets, (B, T): the mean over batch,
 /// quantiles and targets of |tau_m - 1(delta < 0)| huber(delta), where delta = target - quantile
-/// and tau_m = (2 m - 1) / 2M.
-fn quantile_loss(quantiles: &Tensor, targets: &Tensor) -> Result<Tensor> {
+/// and tau_m = (2 m - 1) / 2M. Returns its value, and a tensor with the same gradient.
+///
+/// The second is linear in the quantiles with the loss's slope as constant, because a backward pass
+/// over all pairs of quantile and target would take most of an update's time.
+fn quantile_loss(quantiles: &Tensor, targets: &Tensor) -> Result<(f32, Tensor)> {
     let count = quantiles.dim(1)?;
     let middles = (0..count).map(|m| (2 * m + 1) as f32 / (2 * count) as f32).collect::<Vec<_>>();
     let tau = Tensor::from_vec(middles, (1, count, 1), quantiles.device())?;
-    let delta = targets.unsqueeze(1)?.broadcast_sub(&quantiles.unsqueeze(D::Minus1)?)?;
-    let size = delta.abs()?;
-    let small = size.minimum(&size.ones_like()?)?;
-    // delta² / 2 below 1, |delta| - 1/2 above.
-    let huber = ((&small * &size)? - (small.sqr()? * 0.5)?)?;
-    let below = delta.detach().lt(0.0)?.to_dtype(delta.dtype())?;
-    tau.broadcast_sub(&below)?.abs()?.mul(&huber)?.mean_all()
+    let known = quantiles.detach().unsqueeze(D::Minus1)?;
+    let delta = targets.detach().unsqueeze(1)?.broadcast_sub(&known)?;
+    let below = delta.lt(0.0)?.to_dtype(delta.dtype())?;
+    let clipped = delta.clamp(-1.0, 1.0)?;
+    // Minus the derivative with respect to the quantile, for each pair.
+    let slope = tau.broadcast_sub(&below)?.abs()?.mul(&clipped)?;
+    // huber(delta) = clipped (delta - clipped / 2): delta² / 2 below 1, |delta| - 1/2 above.
+    let loss = slope.mul(&(delta - (clipped * 0.5)?)?)?.mean_all()?.to_scalar()?;
+    let linear = slope.mean(2)?.mul(quantiles)?.mean_all()?.neg()?;
+    Ok((loss, linear))
 }

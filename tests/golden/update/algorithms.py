@@ -59,7 +59,8 @@ class ActorCritic:
     @property
     def networks(self):
         """Every network and target by name."""
-        names = ["critic"] if len(self.critics) == 1 else ["critic_1", "critic_2"]
+        count = len(self.critics)
+        names = ["critic"] if count == 1 else [f"critic_{index + 1}" for index in range(count)]
         pairs = dict(zip(names, self.critics, strict=True))
         slow = {f"{n}_target": c for n, c in zip(names, self.critic_targets, strict=True)}
         return {"actor": self.actor, **pairs, **slow}
@@ -217,7 +218,8 @@ class Tqc(Sac):
     def __init__(self, settings, kit):
         super().__init__(settings, kit)
         inputs = settings.policy_observation_len + settings.critic_action_len
-        self.critics = [mlp(inputs, settings.critic_hidden, QUANTILES) for _ in range(2)]
+        shape = (inputs, settings.critic_hidden, QUANTILES, settings.critic_layer_norm)
+        self.critics = [mlp(*shape) for _ in range(settings.critics)]
         self.critic_targets = copy.deepcopy(self.critics)
         both = [values for critic in self.critics for values in critic.parameters()]
         self.critic_adam = kit.adam(both, settings.critic_learning_rate)

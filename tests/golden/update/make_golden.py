@@ -51,19 +51,20 @@ VARIANTS = {
     "mlp": dict(policy="mlp"),
     "chunk": dict(policy="chunk"),
     "dmp_carry": dict(start="carry"),
-    "dmp_action": dict(start="action", controller="direct"),
     "dmp_first": dict(critic="first"),
     "dmp_observed": dict(start="observed"),
     "dmp_observed_at_rest": dict(start="observed", start_velocity="zero"),
     "dmp_goal_scaling": dict(start="observed", forcing_scaling="goal"),
     "dmp_paper": dict(integrator="paper", alpha_y=25.0, basis_count=3),
+    "dmp_action": dict(start="action", controller="direct"),
+    "dmp_layer_norm": dict(critic_layer_norm=True, critics=3),
 }
 # What concerns only the policy is the same for all algorithms: shown with one.
 CASES = {
-    "ddpg": list(VARIANTS),
+    "ddpg": [name for name in VARIANTS if name != "dmp_layer_norm"],
     "td3": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_first"],
-    "sac": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_action", "dmp_first"],
-    "tqc": ["dmp", "mlp", "chunk", "dmp_carry"],
+    "sac": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_first", "dmp_action"],
+    "tqc": ["dmp", "mlp", "chunk", "dmp_carry", "dmp_layer_norm"],
 }
 
 
@@ -102,7 +103,7 @@ def configuration(case):
         "algorithm.name": case.algorithm,
         "algorithm.critic": case.critic,
         "algorithm.critic_hidden": list(case.critic_hidden),
-        "algorithm.critic_layer_norm": "false",
+        "algorithm.critic_layer_norm": str(case.critic_layer_norm).lower(),
         "algorithm.batch_size": case.batch_size,
         "algorithm.critic_learning_rate": case.critic_learning_rate,
         "algorithm.actor_learning_rate": case.actor_learning_rate,
@@ -113,7 +114,7 @@ def configuration(case):
         keys["algorithm.td3.target_noise_clip"] = SMOOTHING_MAX
         keys["algorithm.td3.actor_interval"] = 2
     if case.algorithm == "tqc":
-        keys["algorithm.tqc.critics"] = 2
+        keys["algorithm.tqc.critics"] = case.critics
         keys["algorithm.tqc.quantiles"] = QUANTILES
         keys["algorithm.tqc.dropped_quantiles"] = DROPPED
     if case.algorithm in ("sac", "tqc"):

@@ -4,12 +4,17 @@ import torch
 from torch import nn
 
 
-def mlp(inputs, hidden, outputs):
-    """ReLU layers and a linear last one, with PyTorch's default initialisation."""
+def mlp(inputs, hidden, outputs, layer_norm=False):
+    """ReLU layers and a linear last one, with PyTorch's default initialisation.
+
+    With layer normalisation (Ba et al. 2016) before each ReLU, if asked for.
+    """
     widths = [inputs, *hidden]
     layers = []
     for before, after in zip(widths, hidden, strict=False):
-        layers += [nn.Linear(before, after), nn.ReLU()]
+        layers += [nn.Linear(before, after)]
+        layers += [nn.LayerNorm(after)] if layer_norm else []
+        layers += [nn.ReLU()]
     return nn.Sequential(*layers, nn.Linear(widths[-1], outputs))
 
 

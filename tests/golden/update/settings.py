@@ -30,6 +30,8 @@ class Settings:
     batch_size: int = 256
     hidden: tuple[int, ...] = (256, 256)
     critic_hidden: tuple[int, ...] = (256, 256)
+    critic_layer_norm: bool = False  # of TQC only, as the next one
+    critics: int = 2
     segment_steps: int = 5
     critic: str = "segment"
     start: str = "zero"
