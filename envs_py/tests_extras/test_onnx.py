@@ -22,7 +22,7 @@ class ExportedGraphs(unittest.TestCase):
         self.folders = sorted(folder.iterdir())
 
     def test_each_graph_returns_rusts_actions(self) -> None:
-        self.assertGreaterEqual(len(self.folders), 13)
+        self.assertGreaterEqual(len(self.folders), 14)
         for folder in self.folders:
             with self.subTest(folder.name):
                 session = onnxruntime.InferenceSession(folder / "policy.onnx")

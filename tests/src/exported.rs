@@ -27,7 +27,7 @@ const CORNERS: [f64; 4] = [0.0, -0.0, 1.0, -1.0];
 type Keys = &'static [(&'static str, &'static str)];
 
 /// Name, task, and configuration keys that differ from the task's defaults.
-pub const KINDS: [(&str, &str, Keys); 13] = [
+pub const KINDS: [(&str, &str, Keys); 14] = [
     ("dmp", "reacher", &[]),
     ("mlp", "pusher", &[("policy.kind", "mlp")]),
     ("sac-chunk", "pusher", &[("algorithm.name", "sac"), ("policy.kind", "chunk")]),
@@ -37,6 +37,7 @@ pub const KINDS: [(&str, &str, Keys); 13] = [
         "pusher",
         &[("algorithm.name", "sac"), ("policy.segment_steps", "8"), ("policy.action_range", "0.6")],
     ),
+    ("tqc-dmp", "reacher", &[("algorithm.name", "tqc")]),
     ("angles", "reacher", &[("policy.start", "observed"), ("policy.rho", "free")]),
     ("values", "panda-reach", &[("policy.start", "observed")]),
     ("resting", "pusher", &[("policy.start", "observed"), ("policy.start_velocity", "zero")]),

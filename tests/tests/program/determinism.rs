@@ -73,6 +73,21 @@ fn on_policy_the_same_seed_gives_the_same_bytes_too() {
     assert!(first == trained(&place, "second", "7", &ndp));
 }
 
+/// With segments that start at the last action.
+#[test]
+fn with_graphs_the_same_seed_gives_the_same_bytes_too() {
+    let place = Workplace::new();
+    let mut more = vec!["--algo", "tqc", "--set", "pacing.updates_per_segment=0.2"];
+    for pair in ["exploration.warm_up_steps=500", "algorithm.batch_size=64"] {
+        more.extend(["--set", pair]);
+    }
+    more.extend(["--set", "policy.start=action", "--set", "policy.controller=direct"]);
+    let first = trained(&place, "first", "7", &more);
+    let last = first.metrics.last().unwrap();
+    assert!(last["updates"].as_u64() > Some(0), "{last}");
+    assert!(first == trained(&place, "second", "7", &more));
+}
+
 #[test]
 fn with_randomised_physics_and_delays_the_same_seed_gives_the_same_bytes_too() {
     let place = Workplace::new();
