@@ -169,7 +169,8 @@ class Policy:
 
         :param y0: start of the DMP, (A,) in units of y, for a policy whose segments start where the
             previous one ended (``policy.start = "carry"`` or ``"action"``). The default is 0, as in
-            training.
+            training. For ``action`` it is tanh⁻¹ of the last action, scaled to [-1, 1]; in training
+            it is at most 2.99 (an action of 0.995).
         :raises ValueError: if y0 is not A finite numbers, or the policy has another start.
         """
         if y0 is not None:

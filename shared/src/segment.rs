@@ -7,8 +7,8 @@
 //!   actions      (K, A)     u, in [-1, 1] unless drawn from a Gaussian; zero after steps_len
 //!   rewards      (K,)       zero after steps_len
 //! ```
-//! An observation here is the policy's input: the environment's observation, followed by the DMP
-//! state (y, yd) if the policy carries it from segment to segment.
+//! An observation here is the policy's input: the environment's observation, followed by the state
+//! (y, yd) of DMP or commands from which a segment starts, if the policy has one.
 
 use bytemuck::{Pod, Zeroable};
 use thiserror::Error;
@@ -78,7 +78,7 @@ const _: () = assert!(size_of::<SegmentHeader>() == 80 && align_of::<SegmentHead
 pub struct SegmentLayout {
     /// Segment length K \[steps\].
     pub segment_steps: usize,
-    /// Observation length O, including the DMP state if carried.
+    /// Observation length O, including the state (y, yd) if the policy has one.
     pub observation_len: usize,
     /// Action length A.
     pub action_len: usize,

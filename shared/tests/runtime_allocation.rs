@@ -26,7 +26,8 @@ fn decisions_steps_and_holds_allocate_nothing() {
         observation_names: Vec::new(),
         goal_rule: None,
     };
-    for keys in [&[][..], &[("policy.kind", "mlp")], &[("policy.start", "carry")]] {
+    let kinds = [&[][..], &[("policy.kind", "mlp")], &[("policy.start", "carry")]];
+    for keys in kinds.into_iter().chain([&[("policy.start", "action")][..]]) {
         let mut layers = Layers::new();
         keys.iter().for_each(|(key, value)| layers.set("test", key, value).unwrap());
         let policy = Policy::new(&layers.finish().unwrap(), &spec).unwrap();

@@ -30,7 +30,7 @@ pub struct NoWindow {
 pub struct BatchShape {
     /// Rows of the batch, B.
     pub rows: usize,
-    /// Length O of an observation, including the DMP state if it is carried.
+    /// Length O of an observation, including the state (y, yd) if the policy has one.
     pub observation_len: usize,
     /// Numbers of the actions that the critic sees: A times K or 1.
     pub actions_len: usize,

@@ -65,7 +65,7 @@ impl Golden {
 
     pub(super) fn config(&self) -> ExperimentConfig {
         let mut layers = Layers::new();
-        // The penalty is not part of the implementation that made the files.
+        // Penalties are not part of the implementation that made the files. The other is 0 anyway.
         layers.set("golden file", "algorithm.action_rate_penalty", "0.0").unwrap();
         for (key, value) in self.about["configuration"].as_object().unwrap() {
             layers.set("golden file", key, value.as_str().unwrap()).unwrap();

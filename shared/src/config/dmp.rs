@@ -156,7 +156,8 @@ pub enum Controller {
     /// Successive differences of y, times `position_scale` (Neural Dynamic Policies). These actions
     /// are unbounded, so only algorithms that clip actions accept this controller.
     Position,
-    /// u = tanh(y), without a controller. With `start = "action"` the actions are continuous.
+    /// u = tanh(y), without a controller. With `start = "action"` the actions are continuous. A
+    /// goal at the bound of `goal_range` = 1 holds |u| = 0.76, of 2 it holds 0.96.
     Direct,
 }
 

@@ -313,14 +313,15 @@ impl ExperimentConfig {
         })?;
         let position = dmp && self.policy.controller == Controller::Position;
         range("policy.start", "action", !(position && self.policy.follows_actions()), || {
-            "another start with policy.controller = \"position\", whose actions are no positions"
+            "another start with policy.controller = \"position\", whose actions are no positions, \
+             or another controller"
                 .into()
         })?;
         let observed = dmp && self.policy.start == Start::Observed;
         let sources = self.task.start_sources.len();
         range("policy.start", "observed", !observed || sources > 0, || {
             format!(
-                "zero or carry; task `{}` has no task.start_sources to read y0 from",
+                "zero, carry or action; task `{}` has no task.start_sources to read y0 from",
                 self.task.name
             )
         })

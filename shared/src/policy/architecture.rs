@@ -172,6 +172,8 @@ mod tests {
             ("policy.kind", "chunk"),
             ("algorithm.name", "sac"),
             ("policy.controller", "position"),
+            ("policy.controller", "direct"),
+            ("policy.start", "action"),
             ("algorithm.name", "ndp"),
         ] {
             assert_ne!(hash_of(&[(key, value)]), same, "{key}");

@@ -115,6 +115,7 @@ fn policy_is_restored_from_the_file_alone() {
         &[("algorithm.name", "ndp"), ("policy.controller", "position")],
         &[("policy.start", "carry"), ("dmp.alpha_y", "12.5"), ("policy.rho", "free")],
         &[("policy.start", "observed"), ("task.start_sources", sources)],
+        &[("policy.start", "action"), ("policy.controller", "direct")],
     ] {
         let (own, snapshot, origin) = saved(keys, &path);
         let opened = open(&path).unwrap();

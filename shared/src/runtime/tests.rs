@@ -348,7 +348,7 @@ fn caller_that_was_frozen_gets_the_hold_and_then_a_new_decision() {
 }
 
 #[test]
-fn only_a_policy_that_carries_its_state_accepts_y0() {
+fn only_a_policy_whose_segments_continue_accepts_y0() {
     let error = runtime(&[]).reset(Some(&[0.0; DIMS])).unwrap_err().to_string();
     assert!(error.contains("do not start where"), "{error}");
     let mut carrying = runtime(CARRY);

@@ -23,7 +23,7 @@ class Settings:
 
     algorithm: str
     policy: str
-    observation_len: int  # the environment's, without a carried state
+    observation_len: int  # the environment's, without the state (y, yd)
     action_len: int
     control_dt_s: float
     start_sources: tuple[Start, ...] = ()

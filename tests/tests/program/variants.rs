@@ -61,6 +61,8 @@ fn neural_dynamic_policies_train() {
     trains("reacher", &ndp(&["--workers", "1"]));
     trains("panda-reach", &ndp(&["--preset", "paper"]));
     trains("pusher", &ndp(&["--set", "policy.controller=inverse"]));
+    let action = ["--set", "policy.start=action", "--set", "policy.controller=direct"];
+    trains("reacher", &ndp(&action));
 }
 
 /// Updates as graphs: of an algorithm with kernels, and of one without.

@@ -5,8 +5,8 @@
 //!                           ├─ Gemm, Relu … ─ Tanh ─ MatMul ─ … ────┤
 //!   state (batch, 2A) ──────┘  network        ranges  DMP's map     └─► next_state (batch, 2A)
 //! ```
-//! `state` and `next_state` exist only if the policy carries (y, yd) from segment to segment. The
-//! graph computes the same as `dmprl_shared::policy`, in the same order; a test compares the two.
+//! `state` and `next_state` exist only if segments start where the previous one ended. The graph
+//! computes the same as `dmprl_shared::policy`, in the same order; a test compares the two.
 
 use anyhow::Context;
 use dmprl_shared::config::{Controller, ForcingScaling, RhoKind, StartSource};

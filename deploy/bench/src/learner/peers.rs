@@ -124,7 +124,7 @@ fn unsupported(config: &ExperimentConfig) -> Option<&'static str> {
         ),
         (
             algorithm.action_rate_penalty + algorithm.action_acceleration_penalty > 0.0,
-            "tests/peers has no penalty on changes of actions",
+            "tests/peers has neither algorithm.action_rate_penalty nor action_acceleration_penalty",
         ),
     ];
     differences.into_iter().find_map(|(differs, why)| differs.then_some(why))

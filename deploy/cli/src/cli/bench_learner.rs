@@ -75,11 +75,12 @@ pub(super) fn run(args: &LearnerArgs) -> anyhow::Result<Outcome> {
         )));
     };
     let threads = args.threads.map(|threads| Value::Integer(threads.into()));
-    // The peers do not implement our penalty on changes of actions.
+    // The peers do not implement our penalties on changes of actions.
     let no_price = (!args.peer.is_empty()).then_some(Value::Float(0.0));
     let flags = [
         flag("--threads", "learner.threads", threads),
-        flag("--peer", "algorithm.action_rate_penalty", no_price),
+        flag("--peer", "algorithm.action_rate_penalty", no_price.clone()),
+        flag("--peer", "algorithm.action_acceleration_penalty", no_price),
     ];
     let sources = args.configured.sources(&args.task, flags)?;
     let config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;

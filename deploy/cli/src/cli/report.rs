@@ -105,7 +105,11 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     };
     let report = Report {
         title,
-        command: format!("dmprl report {}", names.join(" ")),
+        command: format!(
+            "dmprl report {}{}",
+            names.join(" "),
+            if args.pareto { " --pareto" } else { "" }
+        ),
         made: rfc3339(SystemTime::now()),
         commit: dmprl_run::project::git_commit(),
         curves: curves(&results)?,

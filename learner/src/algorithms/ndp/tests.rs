@@ -209,10 +209,11 @@ impl Case {
 
 #[test]
 fn gradients_equal_automatic_differentiation_before_and_after_the_policy_has_moved() {
-    let cases: [&[(&str, &str)]; 3] = [
+    let cases: [&[(&str, &str)]; 4] = [
         &[],
         &[("dmp.forcing_scaling", "none"), ("dmp.integrator", "semi_implicit")],
         &[("policy.controller", "inverse")],
+        &[("policy.controller", "direct")],
     ];
     for keys in cases {
         let fast = [("algorithm.actor_learning_rate", "0.01")];
