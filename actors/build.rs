@@ -7,14 +7,17 @@
 //!
 //! pyo3 chooses the interpreter: `PYO3_PYTHON`, else an active virtual or conda environment, else
 //! `python`, else `python3` on `PATH`.
+//!
+//! With the feature `extension`, nothing is linked: the Python that loads the program provides
+//! these functions.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
-    #[cfg(feature = "python")]
+    #[cfg(all(feature = "python", not(feature = "extension")))]
     python::link();
 }
 
-#[cfg(feature = "python")]
+#[cfg(all(feature = "python", not(feature = "extension")))]
 mod python {
     use std::{path::Path, process::Command};
 

@@ -43,12 +43,15 @@ PYTHON
 }
 
 project=envs_py/pyproject.toml
-{ requirements $project project dependencies; requirements $project build-system requires; } |
-    lock envs_py/locks/base.txt
+{
+    requirements $project project dependencies
+    requirements $project project optional-dependencies sim
+    requirements $project build-system requires
+} | lock envs_py/locks/base.txt
 # The optional parts that dmprl installs by itself.
 for extra in demos search video; do
     requirements $project project optional-dependencies $extra |
         lock envs_py/locks/$extra.txt --constraint envs_py/locks/base.txt
 done
 lock .ci/tools.txt <.ci/tools.in
-requirements pyproject.toml build-system requires | lock deploy/release-tools.txt
+lock deploy/release-tools.txt <deploy/release-tools.in

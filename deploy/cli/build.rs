@@ -12,7 +12,7 @@ const ROOT: &str = "../..";
 
 /// Sources of the program, relative to the project's root, without documentation and tests. The
 /// Python package is not compiled in; a run's manifest has its hash.
-const SOURCES: [&str; 20] = [
+const SOURCES: [&str; 21] = [
     "Cargo.toml",
     "Cargo.lock",
     "shared/Cargo.toml",
@@ -29,6 +29,7 @@ const SOURCES: [&str; 20] = [
     "deploy/cli",
     "deploy/control",
     "deploy/dashboard",
+    "deploy/extension",
     "deploy/run",
     "deploy/supervisor",
     "deploy/sweep",

@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +37,8 @@ class Run:
     @property
     def config(self) -> dict[str, Any]:
         """The resolved configuration, by section."""
+        import tomllib  # since Python 3.11
+
         return tomllib.loads((self.path / "config.toml").read_text())
 
     @property

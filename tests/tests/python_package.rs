@@ -38,7 +38,10 @@ fn package_alone_and_with_the_program_ask_for_the_same() {
         let text = std::fs::read_to_string(project_root().join(manifest)).unwrap();
         let manifest: Table = text.parse().unwrap();
         let mut project = manifest["project"].as_table().unwrap().clone();
-        for of_its_own in ["description", "readme", "license-files"] {
+        // The program's Python, and the command.
+        let of_the_program = ["requires-python", "scripts"];
+        let of_the_text = ["description", "readme", "license-files"];
+        for of_its_own in [&of_the_program[..], &of_the_text].concat() {
             project.remove(of_its_own);
         }
         let extras = project.get_mut("optional-dependencies").unwrap().as_table_mut().unwrap();

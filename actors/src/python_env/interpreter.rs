@@ -1,16 +1,14 @@
 //! Starts and checks the only interpreter of this process, isolated in a virtual environment.
 
 use std::{
-    ffi::{CStr, CString},
-    mem::MaybeUninit,
-    os::unix::ffi::OsStrExt,
+    ffi::CStr,
     path::{Path, PathBuf},
     sync::{Mutex, PoisonError},
 };
 
-use pyo3::{ffi, prelude::*, types::PyDict};
+use pyo3::{prelude::*, types::PyDict};
 
-use super::{LINKED_PYTHON, PythonError, loaded_python_version};
+use super::{LINKED_PYTHON, PythonError, cpython};
 
 /// Python code that runs once after the start.
 ///
@@ -76,61 +74,13 @@ impl Interpreter {
                 })
             };
         }
-        let executable = options.venv.join("bin/python");
-        if !executable.exists() {
-            return Err(PythonError::NoVenv { executable });
-        }
         let python_path = absolute_paths(&options.python_path)?;
-        check_version()?;
-        initialise(&executable)?;
+        cpython::start(&options.venv)?;
         // Python is running from here on, so a later start cannot succeed after an error below.
         *running = Some(options.clone());
         prepare(&options.venv, python_path)?;
         Ok(Self(()))
     }
-}
-
-/// Compares the loaded libpython with the linked one. Works before CPython starts.
-fn check_version() -> Result<(), PythonError> {
-    let got = loaded_python_version();
-    if got == LINKED_PYTHON.version {
-        return Ok(());
-    }
-    Err(PythonError::OtherVersion { expected: LINKED_PYTHON.version.to_owned(), got })
-}
-
-/// Initialises CPython and releases the GIL.
-fn initialise(executable: &Path) -> Result<(), PythonError> {
-    let executable_bytes = c_path(executable)?;
-    let mut preconfig = MaybeUninit::uninit();
-    let mut config = MaybeUninit::uninit();
-    // SAFETY: CPython is not initialised (RUNNING is locked and empty; nothing else in this program
-    // starts it). Both structs are initialised by their Init function before any field is accessed,
-    // and the config is cleared on every path. PyEval_SaveThread follows a successful start on the
-    // same thread, which then holds the GIL.
-    unsafe {
-        ffi::PyPreConfig_InitIsolatedConfig(preconfig.as_mut_ptr());
-        let mut preconfig = preconfig.assume_init();
-        // The default in isolated mode is ASCII, in which a model file with "°" cannot be read.
-        preconfig.utf8_mode = 1;
-        check(ffi::Py_PreInitialize(&raw const preconfig))?;
-
-        ffi::PyConfig_InitIsolatedConfig(config.as_mut_ptr());
-        let config: *mut ffi::PyConfig = config.as_mut_ptr();
-        (*config).install_signal_handlers = 0;
-        (*config).use_hash_seed = 1;
-        (*config).hash_seed = 0;
-        let status = ffi::PyConfig_SetBytesString(
-            config,
-            &raw mut (*config).executable,
-            executable_bytes.as_ptr(),
-        );
-        let result = check(status).and_then(|()| check(ffi::Py_InitializeFromConfig(config)));
-        ffi::PyConfig_Clear(config);
-        result?;
-        ffi::PyEval_SaveThread();
-    }
-    Ok(())
 }
 
 /// Prepares `sys`, compares the installation's prefix with the linked one, and appends the user's
@@ -171,21 +121,6 @@ impl Interpreter {
     }
 }
 
-fn check(status: ffi::PyStatus) -> Result<(), PythonError> {
-    let text = |pointer: *const std::ffi::c_char| {
-        if pointer.is_null() {
-            return String::new();
-        }
-        // SAFETY: not null; CPython's status strings are static and NUL-terminated.
-        unsafe { CStr::from_ptr(pointer) }.to_string_lossy().into_owned()
-    };
-    // SAFETY: a pure predicate on a value that CPython returned.
-    if unsafe { ffi::PyStatus_Exception(status) } == 0 {
-        return Ok(());
-    }
-    Err(PythonError::Initialise { function: text(status.func), message: text(status.err_msg) })
-}
-
 /// Converts to absolute paths: `sys.path` must not depend on a later change of directory.
 fn absolute_paths(paths: &[PathBuf]) -> Result<Vec<String>, PythonError> {
     let absolute = |path: &PathBuf| {
@@ -197,9 +132,4 @@ fn absolute_paths(paths: &[PathBuf]) -> Result<Vec<String>, PythonError> {
         absolute.into_os_string().into_string().map_err(|_| wrong("it is not valid UTF-8"))
     };
     paths.iter().map(absolute).collect()
-}
-
-fn c_path(path: &Path) -> Result<CString, PythonError> {
-    CString::new(path.as_os_str().as_bytes())
-        .map_err(|_| PythonError::Path { path: path.to_owned(), reason: "it contains a NUL byte" })
 }

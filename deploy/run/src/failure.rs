@@ -1,7 +1,6 @@
 //! The outcome of a command: its exit status and the text of its errors.
 
 use std::fmt::{self, Display, Formatter};
-use std::process::ExitCode;
 
 /// How a command that did not fail ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -31,13 +30,13 @@ pub fn wrong_use(message: impl Into<String>) -> anyhow::Error {
 
 /// Returns the exit status for scripts: 0 done, 1 failed, 2 wrong use, 130 interrupted.
 #[must_use]
-pub fn exit_code(result: &anyhow::Result<Outcome>) -> ExitCode {
-    ExitCode::from(match result {
+pub fn exit_status(result: &anyhow::Result<Outcome>) -> u8 {
+    match result {
         Ok(Outcome::Done) => 0,
         Ok(Outcome::Interrupted) => 130,
         Err(error) if error.downcast_ref::<WrongUse>().is_some() => 2,
         Err(_) => 1,
-    })
+    }
 }
 
 /// Formats an error as `error: MESSAGE`, then each cause on its own line.
@@ -72,8 +71,8 @@ mod tests {
     #[test]
     fn wrong_use_is_recognised_below_a_context() {
         let error = Err::<Outcome, _>(wrong_use("no such task")).context("cannot train");
-        assert_eq!(exit_code(&error), ExitCode::from(2));
-        assert_eq!(exit_code(&Err(anyhow::anyhow!("x"))), ExitCode::from(1));
-        assert_eq!(exit_code(&Ok(Outcome::Interrupted)), ExitCode::from(130));
+        assert_eq!(exit_status(&error), 2);
+        assert_eq!(exit_status(&Err(anyhow::anyhow!("x"))), 1);
+        assert_eq!(exit_status(&Ok(Outcome::Interrupted)), 130);
     }
 }

@@ -6,17 +6,16 @@ use std::sync::OnceLock;
 /// Maximum number of ancestors of the current directory in which to look for the project.
 const ANCESTORS_MAX: usize = 16;
 
-/// Finds the folder that contains `envs_py/`: the folder that this program was built from, the
-/// program's own folder (as in a released archive), or the current directory or one above it.
+/// Finds the folder that contains `envs_py/`: the folder that this program was built from, or the
+/// current directory or one above it.
 ///
 /// # Errors
 /// None of these folders contains `envs_py/`.
 pub fn root() -> anyhow::Result<PathBuf> {
     let built_from = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).map(Path::to_owned);
-    let beside = std::env::current_exe().ok().and_then(|file| file.parent().map(Path::to_owned));
     let here = std::env::current_dir().unwrap_or_default();
     let above = here.ancestors().take(ANCESTORS_MAX).map(Path::to_owned);
-    built_from.into_iter().chain(beside).chain(above).find(|path| is_root(path)).ok_or_else(|| {
+    built_from.into_iter().chain(above).find(|path| is_root(path)).ok_or_else(|| {
         anyhow::anyhow!(
             "cannot find the project's Python package; run dmprl inside a clone of the project, or \
              install the package into a virtual environment (in a clone: pip install .)"

@@ -22,7 +22,7 @@ const STAGES: u32 = 8;
 const FOREIGN_FOLDERS: [&str; 5] = ["target", "runs", "__pycache__", ".git", ".venv"];
 /// Start of the names of environments that were replaced.
 const OLD_ENVIRONMENT: &str = ".venv.old-";
-const MEMBERS: [&str; 16] = [
+const MEMBERS: [&str; 17] = [
     "actors",
     "deploy/analysis",
     "deploy/bench",
@@ -31,6 +31,7 @@ const MEMBERS: [&str; 16] = [
     "deploy/cli",
     "deploy/control",
     "deploy/dashboard",
+    "deploy/extension",
     "deploy/run",
     "deploy/supervisor",
     "deploy/sweep",
@@ -164,7 +165,9 @@ fn actors_and_learner_do_not_know_each_other() {
 fn each_foreign_system_is_named_in_one_place() {
     let build_script = |source: &Source| source.path.ends_with("/build.rs");
     let mut places = named_outside("pyo3", |source| {
-        source.is_within("actors/src/python_env") || build_script(source)
+        source.is_within("actors/src/python_env")
+            || source.is_within("deploy/extension")
+            || build_script(source)
     });
     for word in ["iceoryx2", "iceoryx2_cal", "iceoryx2_bb_elementary_traits"] {
         places.extend(named_outside(word, |source| {
@@ -183,7 +186,10 @@ fn each_foreign_system_is_named_in_one_place() {
         ("candle", "learner"),
     ];
     for (prefix, owner) in owners {
-        let others = dependents(prefix).into_iter().filter(|member| !member.starts_with(owner));
+        let is_owner = |member: &str| {
+            member.starts_with(owner) || (prefix, member) == ("pyo3", "deploy/extension")
+        };
+        let others = dependents(prefix).into_iter().filter(|member| !is_owner(member));
         places.extend(others.map(|member| format!("{member}/Cargo.toml depends on {prefix}")));
     }
     none(

@@ -10,7 +10,8 @@ const CIRCLE_MAX: usize = 3;
 
 /// The crates of the program and the other crates of the workspace that each uses, from the
 /// highest to the lowest. A crate may only use those below it.
-const CRATES: [(&str, &[&str]); 13] = [
+const CRATES: [(&str, &[&str]); 14] = [
+    ("deploy/extension", &["actors"]),
     (
         "deploy/cli",
         &[

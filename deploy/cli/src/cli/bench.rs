@@ -16,7 +16,7 @@ use super::bench_transport::{self, TransportArgs};
 use super::bench_values::{interpreter, seconds};
 use super::configuration::{merge, refuse};
 use super::configured::{ConfiguredArgs, make_absolute};
-use super::{cores, emit, prepare_python, python_home, this_program};
+use super::{cores, emit, prepare_python, python_home, python_of, this_program};
 use crate::terminal::TerminalProgress;
 
 /// Queue length in segments per environment, unless configured. It lets the receiver sleep while a
@@ -134,7 +134,7 @@ fn rollout(args: &RolloutArgs) -> anyhow::Result<Outcome> {
     let bench = RolloutBench {
         program: this_program()?,
         config,
-        peer_python: peer_python.unwrap_or_else(|| venv.join("bin/python")),
+        peer_python: peer_python.unwrap_or_else(|| python_of(&venv)),
         controls: args.controls,
         venv,
         package_path: python_home()?.1,

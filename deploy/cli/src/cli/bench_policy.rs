@@ -16,7 +16,7 @@ use dmprl_shared::seeds;
 use super::bench_values::interpreter;
 use super::configuration::{merge, refuse};
 use super::configured::ConfiguredArgs;
-use super::{cores, emit, open_run, prepare_python, python_home};
+use super::{cores, emit, open_run, prepare_python, python_home, python_of};
 
 const HELP: &str = "\
 One observation at a time, on one core, as on a robot. In every round each of these makes --calls
@@ -66,7 +66,7 @@ pub(super) fn run(args: &PolicyArgs) -> anyhow::Result<Outcome> {
     let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
     let python = match peer_python {
         Some(python) => python,
-        None => prepare_python()?.join("bin/python"),
+        None => python_of(&prepare_python()?),
     };
     let bench = PolicyBench {
         opened,

@@ -9,7 +9,7 @@ use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_shared::config::DeliveryLevel;
 
 use super::bench_values::{interpreter, seconds};
-use super::{cores, emit, python_home, this_program};
+use super::{cores, emit, python_home, python_of, this_program};
 use crate::terminal::TerminalProgress;
 
 const HELP: &str = "\
@@ -107,7 +107,7 @@ pub(super) fn run(args: &TransportArgs) -> anyhow::Result<Outcome> {
             Level::Memory => DeliveryLevel::Memory,
             Level::Log => DeliveryLevel::Log,
         },
-        peer_python: peer_python.unwrap_or_else(|| venv.join("bin/python")),
+        peer_python: peer_python.unwrap_or_else(|| python_of(&venv)),
         package_path,
         rounds: usize::from(args.rounds),
         duration: Duration::from_secs_f64(args.seconds),

@@ -13,7 +13,7 @@ use tempfile::TempDir;
 
 use super::configuration::{Sources, merge};
 use super::configured::{environment, flag, make_absolute, paths, project_folder};
-use super::{emit, prepare_python, prepare_python_with};
+use super::{emit, prepare_python, prepare_python_with, python_of};
 use crate::terminal::say;
 
 /// Prefix of the name of a data set in Minari's local store.
@@ -197,7 +197,7 @@ fn call(source: &str, words: &[OsString], request: &[OsString]) -> anyhow::Resul
     let python = if is_foreign(source) {
         prepare_python_with(EXTRA)?.1
     } else if Path::new(source).is_file() {
-        prepare_python()?.join("bin/python")
+        python_of(&prepare_python()?)
     } else {
         return Err(wrong_use(format!("demonstrations {source}: no such file or folder")));
     };

@@ -31,14 +31,14 @@ mod tasks;
 mod train;
 mod trust;
 
+use std::ffi::OsString;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 use dmprl_bench::{SegmentFeederArgs, TransportWorkerArgs, segment_feeder, transport_worker};
-use dmprl_run::failure::{Outcome, exit_code, render, wrong_use};
+use dmprl_run::failure::{Outcome, exit_status, render, wrong_use};
 use dmprl_run::{Progress, RunDirectory, Session, Zoo};
 use dmprl_shared::config::ExperimentConfig;
 
@@ -48,7 +48,7 @@ use crate::roles::{
 use crate::terminal::messages::{self, MessageStyle};
 use crate::terminal::{ProgressStyle, TerminalProgress};
 #[cfg(feature = "python")]
-use dmprl_supervisor::python_setup::{Home, ensure_extra};
+use dmprl_supervisor::python_setup::{Home, PythonEnvironment, ensure_extra, packages};
 use session::name_limits;
 pub use session::{TrainingPlan, train_session};
 
@@ -156,18 +156,32 @@ fn long_help() -> String {
     format!("{ROLES}{EXAMPLES}")
 }
 
-/// Parses the command line, runs the command and returns its exit status.
+/// candle computes the products of graphs on rayon's threads, and asks this variable for their
+/// number.
+const CANDLE_THREADS: &str = "RAYON_NUM_THREADS";
+
+/// Parses a command line, runs the command and returns its exit status.
+///
+/// `words` begins with the path of this program, which is started for other roles.
+///
+/// # Safety
+/// No other thread uses environment variables.
 #[must_use]
-pub fn main() -> ExitCode {
+pub unsafe fn main(words: Vec<OsString>) -> u8 {
+    // The products of our networks are too small for several threads, and rayon's wait actively.
+    if std::env::var_os(CANDLE_THREADS).is_none() {
+        // SAFETY: As this function.
+        unsafe { std::env::set_var(CANDLE_THREADS, "1") };
+    }
     dmprl_run::project::set_git_commit(env!("GIT_COMMIT_OF_BUILD"));
     // Handles help and version; on a usage error, suggests similar names and exits with 2.
-    let arguments = Arguments::parse();
+    let arguments = Arguments::parse_from(words);
     messages::install(arguments.command.message_style());
     let result = run(arguments.command);
     if let Err(error) = &result {
         messages::show_error(&render(error));
     }
-    exit_code(&result)
+    exit_status(&result)
 }
 
 impl Command {
@@ -252,7 +266,7 @@ fn prepare_python() -> anyhow::Result<PathBuf> {
 /// Creates the manifest's record of a session that trains `config` in this virtual environment.
 #[cfg(feature = "python")]
 fn training_session(config: &ExperimentConfig, venv: &Path) -> anyhow::Result<Session> {
-    Session::training(config, dmprl_supervisor::python_setup::packages(&venv.join("bin/python"))?)
+    Session::training(config, packages(&python_of(venv))?)
 }
 
 #[cfg(not(feature = "python"))]
@@ -284,7 +298,18 @@ fn python_home() -> anyhow::Result<(PathBuf, PathBuf)> {
 
 #[cfg(not(feature = "python"))]
 fn prepare_python_with(_extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
-    prepare_python().map(|venv| (venv.clone(), venv.join("bin/python")))
+    prepare_python().map(|venv| (venv.clone(), python_of(&venv)))
+}
+
+/// Returns the interpreter of a virtual environment.
+#[cfg(feature = "python")]
+fn python_of(venv: &Path) -> PathBuf {
+    PythonEnvironment::of(venv.to_owned()).executable
+}
+
+#[cfg(not(feature = "python"))]
+fn python_of(venv: &Path) -> PathBuf {
+    venv.join("bin/python")
 }
 
 #[cfg(not(feature = "python"))]
@@ -305,6 +330,10 @@ fn open_run(path: &Path) -> anyhow::Result<RunDirectory> {
 
 /// Returns the path of this program, which also plays the roles: all processes are the same build.
 fn this_program() -> anyhow::Result<PathBuf> {
+    #[cfg(feature = "python")]
+    if let Some(host) = dmprl_actors::python_env::host() {
+        return Ok(host.program.clone());
+    }
     std::env::current_exe().context("cannot find the path of this program")
 }
 

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use dmprl_actors::python_env::{LINKED_PYTHON, loaded_python_version};
+use dmprl_actors::python_env::{LINKED_PYTHON, host, loaded_python_version};
 use dmprl_supervisor::answer;
-use dmprl_supervisor::python_setup::{Home, State};
+use dmprl_supervisor::python_setup::{Home, PythonEnvironment, State};
 use serde::Deserialize;
 
 use super::Check;
@@ -44,6 +44,8 @@ pub(super) fn checks() -> Vec<Check> {
     let home = Home::find();
     let state = home.as_ref().map_or(State::Missing, Home::state);
     match facts() {
+        // Nothing is linked or built.
+        Ok(facts) if host().is_some() => checks.push(interpreter(&facts)),
         Ok(facts) => checks.extend([
             interpreter(&facts),
             library(&loaded_python_version()),
@@ -84,7 +86,8 @@ fn interpreter(facts: &Facts) -> Check {
         );
         return Check::problem("python", found, "rebuild: cargo build --release");
     }
-    Check::ok("python", format!("{number}, {}, as at build time", LINKED_PYTHON.executable))
+    let role = if host().is_some() { "which runs this program" } else { "as at build time" };
+    Check::ok("python", format!("{number}, {}, {role}", LINKED_PYTHON.executable))
 }
 
 /// Compares the version of the loaded libpython. It exists: otherwise this program would not have
@@ -142,7 +145,10 @@ fn environment(venv: &Path, state: State) -> Vec<Check> {
 fn packages(venv: &Path) -> Check {
     const NAME: &str = "packages";
     let [isolated, no_bytecode, command] = QUIETLY;
-    match answer(venv.join("bin/python"), &[isolated, no_bytecode, command, PACKAGES]) {
+    match answer(
+        PythonEnvironment::of(venv.to_owned()).executable,
+        &[isolated, no_bytecode, command, PACKAGES],
+    ) {
         // Importing may print; the versions come last.
         Ok(text) => Check::ok(NAME, text.lines().last().unwrap_or_default()),
         Err(error) => {

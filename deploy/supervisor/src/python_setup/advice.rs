@@ -1,6 +1,6 @@
 //! Derives a remedy from the output of a failed `venv` or `pip`.
 
-use dmprl_actors::python_env::LINKED_PYTHON;
+use dmprl_actors::python_env::{LINKED_PYTHON, host};
 
 /// Phrases in the output and their causes. The first match counts.
 const CAUSES: [(&str, Cause); 17] = [
@@ -44,9 +44,17 @@ pub(super) fn advice(output: &str) -> String {
         Cause::NoVenv => {
             format!("{python} lacks its venv module. Debian, Ubuntu: apt install python3-venv\n")
         }
-        Cause::NoPip => {
-            format!("{python} lacks pip. Debian, Ubuntu: apt install python3-pip python3-venv\n")
-        }
+        Cause::NoPip => match host().map(|host| host.executable.display()) {
+            Some(python) => format!(
+                "{python} has no pip, with which dmprl installs packages. Add it: uv pip install \
+                 pip, or {python} -m ensurepip\n"
+            ),
+            None => {
+                format!(
+                    "{python} lacks pip. Debian, Ubuntu: apt install python3-pip python3-venv\n"
+                )
+            }
+        },
         Cause::DiskFull => "The disk is full.\n".to_owned(),
         Cause::NoNetwork => "The package index cannot be reached. The first start downloads \
              gymnasium, mujoco and numpy, the first search Optuna, and the first video PyAV; later \

@@ -5,13 +5,16 @@ use std::{collections::BTreeMap, ffi::OsStr, fs, path::Path};
 use anyhow::{Context, Result};
 use toml::{Table, Value};
 
-use super::requirement::normalised;
+use super::requirement::{OURS, Requirement, normalised};
+
+/// The optional part with the simulation, which every command with environments needs.
+pub(super) const SIMULATION: &str = "sim";
 
 /// Requirements of the package, in pip's syntax.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Declared {
     /// What the package itself needs.
-    pub base: Vec<String>,
+    base: Vec<String>,
     /// What each optional part needs.
     extras: BTreeMap<String, Vec<String>>,
 }
@@ -31,16 +34,35 @@ impl Declared {
         Ok(Self::of_metadata(&text))
     }
 
-    /// Returns the requirements of an optional part.
+    /// Returns the requirements of an environment in which simulations run.
+    pub(super) fn base(&self) -> Vec<String> {
+        let simulation = self.extras.get(SIMULATION).cloned().unwrap_or_default();
+        self.base.iter().cloned().chain(simulation).collect()
+    }
+
+    /// Returns the requirements of an optional part, including those of parts that it consists of,
+    /// such as `dmprl[video]`.
     ///
     /// # Errors
     /// There is no such part; the error lists all.
-    pub(super) fn extra(&self, extra: &str) -> Result<&[String]> {
-        let found = self.extras.get(extra).map(Vec::as_slice);
-        found.with_context(|| {
+    pub(super) fn extra(&self, extra: &str) -> Result<Vec<String>> {
+        let found = self.extras.get(extra).with_context(|| {
             let known: Vec<&str> = self.extras.keys().map(String::as_str).collect();
             format!("dmprl has no optional part `{extra}`, only: {}", known.join(", "))
-        })
+        })?;
+        let mut requirements = Vec::new();
+        for line in found {
+            let requirement = Requirement::of_line(line);
+            match requirement.name().as_deref() {
+                Some(OURS) => {
+                    for part in requirement.extras().iter().filter(|part| *part != extra) {
+                        requirements.extend(self.extra(part)?);
+                    }
+                }
+                _ => requirements.push(line.clone()),
+            }
+        }
+        Ok(requirements)
     }
 
     fn of_project(project: &Table) -> Self {
@@ -88,16 +110,23 @@ mod tests {
         let metadata = "Name: dmprl\nRequires-Dist: numpy>=2\n\
                         Requires-Dist: av>=18,<19 ; extra == 'video'\n\
                         Requires-Dist: pillow>=12 ; extra == \"video\"\n\
-                        Requires-Dist: optuna>=5 ; extra == 'search'\n\n\
+                        Requires-Dist: optuna>=5 ; extra == 'search'\n\
+                        Requires-Dist: dmprl[video,sim] ; extra == 'all'\n\
+                        Requires-Dist: mujoco>=4 ; extra == 'sim'\n\n\
                         Requires-Dist: prose ; extra == 'video'\n";
         let project = "[project]\ndependencies = ['numpy>=2']\n\
                        [project.optional-dependencies]\nvideo = ['av>=18,<19', 'pillow>=12']\n\
-                       search = ['optuna>=5']\n";
+                       search = ['optuna>=5']\nsim = ['mujoco>=4']\n\
+                       all = ['dmprl[video,sim]']\n";
         let declared = Declared::of_metadata(metadata);
         assert_eq!(declared, Declared::of_project(&project.parse().unwrap()));
-        assert_eq!(declared.base, ["numpy>=2"]);
+        assert_eq!(declared.base(), ["numpy>=2", "mujoco>=4"]);
+        assert_eq!(declared.extra("all").unwrap(), ["av>=18,<19", "pillow>=12", "mujoco>=4"]);
         assert_eq!(declared.extra("video").unwrap(), ["av>=18,<19", "pillow>=12"]);
         let error = declared.extra("sound").unwrap_err().to_string();
-        assert!(error.ends_with("no optional part `sound`, only: search, video"), "{error}");
+        assert!(
+            error.ends_with("no optional part `sound`, only: all, search, sim, video"),
+            "{error}"
+        );
     }
 }

@@ -10,6 +10,7 @@ use dmprl_actors::python_env::LINKED_PYTHON;
 
 use super::{
     command::Setup,
+    declared::Declared,
     environment::PythonEnvironment,
     home::Home,
     lock::locked,
@@ -74,6 +75,48 @@ pub fn ensure(project_root: &Path, progress: &dyn Fn(&str)) -> Result<PythonEnvi
     })?;
     stamp.write(&environment.venv)?;
     progress("python environment: ready");
+    Ok(environment)
+}
+
+/// Ensures that the environment of `home`, which exists, has the requirements of an optional part.
+pub(super) fn ensure_installed(
+    home: &Home,
+    extra: &str,
+    progress: &dyn Fn(&str),
+) -> Result<PythonEnvironment> {
+    let environment = PythonEnvironment::of(home.venv());
+    let declared = Declared::read(&home.requirements())?;
+    let requirements = declared.extra(extra)?;
+    let locked_packages = match home {
+        Home::Clone(_) => locks::of_extra(&home.package_path(), extra),
+        Home::Installed(_) => None,
+    };
+    let mut text = requirements.join("\n");
+    if let Some(path) = &locked_packages {
+        let packages = fs::read_to_string(path);
+        text += &packages.with_context(|| format!("cannot read {}", path.display()))?;
+    }
+    let stamp = together::extra_stamp(&environment.venv, extra);
+    let is_ready = || fs::read_to_string(&stamp).is_ok_and(|found| found == text);
+    if is_ready() {
+        return Ok(environment);
+    }
+    let lock = locked(&home.lock(), progress)?;
+    // A concurrent start may have been faster.
+    if !is_ready() {
+        let setup = Setup { environment: &environment, lock: &lock, progress };
+        let wanted = requirements.join(" ");
+        match &locked_packages {
+            Some(path) => setup.install_locked(&format!("installing {wanted}"), path),
+            None => setup.install_together(&requirements),
+        }
+        .with_context(|| format!("cannot install {wanted}"))?;
+        fs::write(&stamp, text).with_context(|| format!("cannot write {}", stamp.display()))?;
+        // The locked versions may not go with a user's packages.
+        together::install_user_packages(home, &setup, &UserPackages::read(home.user_packages())?)
+            .with_context(|| format!("the packages that you added do not go with {wanted}"))?;
+        progress("python environment: ready");
+    }
     Ok(environment)
 }
 

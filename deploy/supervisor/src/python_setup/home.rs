@@ -1,13 +1,14 @@
 //! Finds this program's Python package: in a clone of the project, or where pip installed both.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use anyhow::{Context, Result};
-use dmprl_actors::python_env::LINKED_PYTHON;
+use anyhow::Result;
+use dmprl_actors::python_env::{HostPython, host};
 use dmprl_run::project;
 
 use super::{
-    ensure::{State, ensure, state},
+    declared::SIMULATION,
+    ensure::{State, ensure, ensure_installed, state},
     environment::PythonEnvironment,
     paths::{LOCK, PACKAGE, USER_PACKAGES, VENV},
 };
@@ -17,21 +18,20 @@ use super::{
 pub enum Home {
     /// The project's directory, with `envs_py` and `.venv`, which is created on demand.
     Clone(PathBuf),
-    /// The environment into which pip installed program and package. It belongs to its user: dmprl
-    /// never recreates it, and installs there only what a command needs or its user adds.
-    Installed(PythonEnvironment),
+    /// The Python that runs this program, where pip installed program and package. It belongs to
+    /// its user: dmprl never recreates it, and installs there only what a command needs or its user
+    /// adds.
+    Installed(&'static HostPython),
 }
 
 impl Home {
-    /// Finds the environment into which this program was installed, or else the project's
-    /// directory.
+    /// Returns the Python that runs this program, or else the project's directory.
     ///
     /// # Errors
-    /// Neither exists, or the path of this program cannot be found.
+    /// Neither exists.
     pub fn find() -> Result<Self> {
-        let program = std::env::current_exe().context("cannot find the path of this program")?;
-        match installed(&program) {
-            Some(environment) => Ok(Self::Installed(environment)),
+        match host() {
+            Some(host) => Ok(Self::Installed(host)),
             None => project::root().map(Self::Clone),
         }
     }
@@ -43,7 +43,8 @@ impl Home {
     pub fn ensure(&self, progress: &dyn Fn(&str)) -> Result<PythonEnvironment> {
         match self {
             Self::Clone(root) => ensure(root, progress),
-            Self::Installed(environment) => Ok(environment.clone()),
+            Self::Installed(host) if host.simulates => Ok(PythonEnvironment::of(self.venv())),
+            Self::Installed(_) => ensure_installed(self, SIMULATION, progress),
         }
     }
 
@@ -61,7 +62,7 @@ impl Home {
     pub fn venv(&self) -> PathBuf {
         match self {
             Self::Clone(root) => root.join(VENV),
-            Self::Installed(environment) => environment.venv.clone(),
+            Self::Installed(host) => host.prefix.clone(),
         }
     }
 
@@ -70,7 +71,7 @@ impl Home {
     pub fn package_path(&self) -> PathBuf {
         match self {
             Self::Clone(root) => root.join(PACKAGE),
-            Self::Installed(environment) => site_packages(&environment.venv),
+            Self::Installed(host) => host.packages.clone(),
         }
     }
 
@@ -78,7 +79,7 @@ impl Home {
     pub(super) fn lock(&self) -> PathBuf {
         match self {
             Self::Clone(root) => root.join(LOCK),
-            Self::Installed(environment) => environment.venv.join(LOCK),
+            Self::Installed(host) => host.prefix.join(LOCK),
         }
     }
 
@@ -86,7 +87,7 @@ impl Home {
     pub(super) fn user_packages(&self) -> PathBuf {
         match self {
             Self::Clone(root) => root.join(USER_PACKAGES),
-            Self::Installed(environment) => environment.venv.join(USER_PACKAGES),
+            Self::Installed(host) => host.prefix.join(USER_PACKAGES),
         }
     }
 
@@ -94,49 +95,12 @@ impl Home {
     pub(super) fn requirements(&self) -> PathBuf {
         match self {
             Self::Clone(root) => root.join(PACKAGE).join("pyproject.toml"),
-            Self::Installed(environment) => metadata(&environment.venv),
+            Self::Installed(host) => metadata(host),
         }
     }
 }
 
-/// Returns the environment whose `bin` contains `program`, if pip installed it there with the
-/// package of the same version.
-fn installed(program: &Path) -> Option<PythonEnvironment> {
-    let bin = program.parent()?;
-    let environment = PythonEnvironment::of(bin.parent()?.to_owned());
-    let is_there = environment.executable.exists() && metadata(&environment.venv).is_file();
-    (bin.file_name()? == "bin" && is_there).then_some(environment)
-}
-
-fn site_packages(prefix: &Path) -> PathBuf {
-    let number = LINKED_PYTHON.version_number();
-    let minor = number.rsplit_once('.').map_or(number, |(minor, _)| minor);
-    prefix.join("lib").join(format!("python{minor}")).join("site-packages")
-}
-
-fn metadata(prefix: &Path) -> PathBuf {
-    let folder = format!("dmprl-{}.dist-info", env!("CARGO_PKG_VERSION"));
-    site_packages(prefix).join(folder).join("METADATA")
-}
-
-#[cfg(test)]
-mod tests {
-    use std::fs;
-
-    use super::*;
-
-    #[test]
-    fn program_is_installed_beside_the_package_of_its_version() {
-        let directory = tempfile::tempdir().unwrap();
-        let (prefix, bin) = (directory.path(), directory.path().join("bin"));
-        let program = bin.join("dmprl");
-        fs::create_dir(&bin).unwrap();
-        fs::write(bin.join("python"), "").unwrap();
-        assert_eq!(installed(&program), None, "a program beside any Python is not installed");
-        let metadata = metadata(prefix);
-        fs::create_dir_all(metadata.parent().unwrap()).unwrap();
-        fs::write(&metadata, "").unwrap();
-        assert_eq!(installed(&program), Some(PythonEnvironment::of(prefix.to_owned())));
-        assert_eq!(installed(&prefix.join("libexec/dmprl")), None);
-    }
+/// Metadata of the package, as pip installed it.
+fn metadata(host: &HostPython) -> PathBuf {
+    host.packages.join(format!("dmprl-{}.dist-info", env!("CARGO_PKG_VERSION"))).join("METADATA")
 }

@@ -37,15 +37,15 @@ pub(super) fn install_user_packages(
         return Ok(());
     }
     let declared = Declared::read(&home.requirements())?;
-    let mut requirements = declared.base.clone();
+    let mut requirements = declared.base();
     for extra in installed_extras(&setup.environment.venv) {
         // A part that a later version of dmprl does not have any more needs nothing.
-        requirements.extend_from_slice(declared.extra(&extra).unwrap_or_default());
+        requirements.extend(declared.extra(&extra).unwrap_or_default());
     }
     for requirement in &user.list {
         if requirement.name().as_deref() == Some(OURS) {
             for extra in requirement.extras() {
-                requirements.extend_from_slice(declared.extra(&extra)?);
+                requirements.extend(declared.extra(&extra)?);
             }
         } else {
             requirements.push(requirement.line().to_owned());
@@ -59,8 +59,8 @@ pub(super) fn known(home: &Home, user: &UserPackages) -> Result<Vec<Requirement>
     let declared = Declared::read(&home.requirements())?;
     let of_list = user.list.iter().filter(|it| it.name().as_deref() == Some(OURS));
     let extras = of_list.flat_map(Requirement::extras).chain(installed_extras(&home.venv()));
-    let of_extras = extras.flat_map(|extra| declared.extra(&extra).unwrap_or_default().to_vec());
-    let lines = declared.base.iter().cloned().chain(of_extras).chain([OURS.to_owned()]);
+    let of_extras = extras.flat_map(|extra| declared.extra(&extra).unwrap_or_default());
+    let lines = declared.base().into_iter().chain(of_extras).chain([OURS.to_owned()]);
     let mut known: Vec<_> = lines.map(|line| Requirement::of_line(&line)).collect();
     if let Home::Clone(_) = home {
         known.extend(locks::all_packages(&home.package_path()));

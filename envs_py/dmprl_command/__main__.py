@@ -1,0 +1,5 @@
+"""Runs the command with ``python -m dmprl_command``."""
+
+from dmprl_command import main
+
+main()
