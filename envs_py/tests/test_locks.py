@@ -67,10 +67,11 @@ class LockTest(unittest.TestCase):
                 fits = requirement.specifier.contains(version, prereleases=True)
                 self.assertTrue(fits, f"{requirement}, locked {version}: {REMEDY}")
 
-    def test_base_lock_has_what_the_package_needs_and_its_build_tool(self):
+    def test_base_lock_has_package_simulation_and_build_tool(self):
         project = self.manifest["project"]
+        simulation = project["optional-dependencies"]["sim"]
         build = self.manifest["build-system"]["requires"]
-        self.check("base", [*project["dependencies"], *build])
+        self.check("base", [*project["dependencies"], *simulation, *build])
 
     def test_parts_that_the_program_installs_are_locked_and_go_with_the_base(self):
         extras = self.manifest["project"]["optional-dependencies"]
