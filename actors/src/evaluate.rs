@@ -105,7 +105,7 @@ impl Evaluator {
         environments: PythonEnvironments,
         envs: usize,
     ) -> Result<Self, PolicyError> {
-        let policy = Policy::new(config, environments.spec())?;
+        let policy = Policy::new(config.policy_description(environments.spec()))?;
         // The number of repeats of an episode has its own limit.
         let faults = Faults::new(envs, u32::MAX);
         Ok(Self {

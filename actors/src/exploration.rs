@@ -234,7 +234,7 @@ mod tests {
             control_dt_s: 0.02,
             episode_steps: 50,
         };
-        let policy = Policy::new(&config, &spec).unwrap();
+        let policy = Policy::new(config.policy_description(&spec)).unwrap();
         let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         let mut runner = PolicyRunner::new(policy, ENVS);
         runner.take_policy(&parameters);

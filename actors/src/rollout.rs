@@ -131,7 +131,7 @@ impl Rollout {
         identity: Identity,
     ) -> Result<Self, RolloutError> {
         let envs = config.actors.envs_per_worker;
-        let policy = Policy::new(config, environments.spec())?;
+        let policy = Policy::new(config.policy_description(environments.spec()))?;
         let layout = policy.layout();
         // A restarted worker starts new episodes, which must differ from its predecessor's.
         let worker = identity.stream();

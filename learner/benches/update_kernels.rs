@@ -106,7 +106,7 @@ fn config(threads: &str, precision: &str, norm: &str) -> (ExperimentConfig, EnvS
 
 fn update(threads: &str, precision: &str, norm: &str) -> impl FnMut() + 'static {
     let (config, spec) = config(threads, precision, norm);
-    let policy = Policy::new(&config, &spec).expect("a policy");
+    let policy = Policy::new(config.policy_description(&spec)).expect("a policy");
     let mut algorithm = Algorithm::new(&config, &policy, None).expect("an algorithm");
     let mut batch = Batch::new(algorithm.batch_shape());
     let numbers = [

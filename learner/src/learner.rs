@@ -110,7 +110,7 @@ impl Learner {
         spec: &EnvSpec,
         run_id: u64,
     ) -> Result<Self, LearnerError> {
-        let policy = Policy::new(&config, spec)?;
+        let policy = Policy::new(config.policy_description(spec))?;
         let (workers, envs) = (config.places(), config.actors.envs_per_worker);
         let layout = policy.layout();
         let regime = Regime::new(&config, &policy, spec.goal_rule.as_deref())?;

@@ -70,7 +70,7 @@ fn allocations(case: Case, precision: &str, threads: &str) -> u64 {
     }
     let config = layers.finish().unwrap();
     let spec = spec();
-    let policy = Policy::new(&config, &spec).unwrap();
+    let policy = Policy::new(config.policy_description(&spec)).unwrap();
     let mut algorithm = Algorithm::new(&config, &policy, spec.goal_rule.as_deref()).unwrap();
     let batch = Batch::new(algorithm.batch_shape());
     let mut update = |count| {

@@ -11,6 +11,7 @@ pub mod dmp;
 pub mod goal_rule;
 pub mod parameters;
 pub mod policy;
+mod policy_description;
 pub mod policy_file;
 pub mod runtime;
 pub mod seeds;

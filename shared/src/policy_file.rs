@@ -197,7 +197,7 @@ pub fn open(path: &Path) -> Result<OpenedPolicy, PolicyFileError> {
     };
     let description: PolicyDescription =
         serde_json::from_str(text).map_err(|error| invalid(DESCRIPTION_KEY, &error))?;
-    let policy = description.build().map_err(|error| invalid(DESCRIPTION_KEY, &error))?;
+    let policy = Policy::new(description).map_err(|error| invalid(DESCRIPTION_KEY, &error))?;
     let origin = contents.fields.get(ORIGIN_KEY).map(|text| serde_json::from_str(text));
     let origin = origin.transpose().map_err(|error| invalid(ORIGIN_KEY, &error))?;
     let snapshot = contents.snapshot(&policy, Match::Architecture)?;

@@ -134,7 +134,7 @@ fn policy(hold: Option<&Hold>) -> Vec<u8> {
         observation_names: Vec::new(),
         goal_rule: None,
     };
-    let policy = Policy::new(&Layers::new().finish().unwrap(), &spec).unwrap();
+    let policy = Policy::new(Layers::new().finish().unwrap().policy_description(&spec)).unwrap();
     let mut values = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
     values.iter_mut().for_each(|value| *value *= 5.0);
     let architecture_hash = policy.architecture_hash();

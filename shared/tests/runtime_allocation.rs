@@ -30,7 +30,7 @@ fn decisions_steps_and_holds_allocate_nothing() {
     for keys in kinds.into_iter().chain([&[("policy.start", "action")][..]]) {
         let mut layers = Layers::new();
         keys.iter().for_each(|(key, value)| layers.set("test", key, value).unwrap());
-        let policy = Policy::new(&layers.finish().unwrap(), &spec).unwrap();
+        let policy = Policy::new(layers.finish().unwrap().policy_description(&spec)).unwrap();
         let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         let mut runtime = PolicyRuntime::new(policy, &parameters);
         let observation = [0.1, -0.2, 0.3, -0.4];

@@ -111,7 +111,7 @@ pub fn policy(task: &str, keys: &[(&str, &str)]) -> OpenedPolicy {
         layers.set("test", key, value).unwrap();
     }
     let config: ExperimentConfig = layers.finish().unwrap().resolve(Limits { cores: 2 }).unwrap();
-    let policy = Policy::new(&config, &spec(task)).unwrap();
+    let policy = Policy::new(config.policy_description(&spec(task))).unwrap();
     let mut values = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
     // Initial networks hardly leave the middle of the tanh.
     values.iter_mut().for_each(|value| *value *= 2.0);

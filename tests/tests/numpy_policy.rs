@@ -75,7 +75,7 @@ fn assert_near(got: &[f32], expected: &[f32], what: &str) {
 
 fn assert_same(task: &str, keys: &[(&str, &str)]) {
     let (config, spec) = (config(task, keys), spec(task));
-    let policy = Policy::new(&config, &spec).unwrap();
+    let policy = Policy::new(config.policy_description(&spec)).unwrap();
     let mut parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
     // Initial networks hardly leave the middle of the tanh.
     parameters.iter_mut().for_each(|parameter| *parameter *= 3.0);

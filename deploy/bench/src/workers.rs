@@ -97,7 +97,7 @@ impl Workers {
             spec = Some(receive_spec(child, watch, limit)?);
         }
         let spec = spec.context("no worker")?;
-        let policy = Policy::new(config, &spec)?;
+        let policy = Policy::new(config.policy_description(&spec))?;
         let mut random = seeds::stream(config.run.seed, "actor parameters", 0);
         let snapshot = ParameterSnapshot {
             version: 1,

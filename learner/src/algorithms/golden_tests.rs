@@ -120,7 +120,7 @@ impl Golden {
     fn check(mut self, backend: Backend) {
         let mut config = self.config();
         config.learner.backend = backend;
-        let policy = Policy::new(&config, &spec()).unwrap();
+        let policy = Policy::new(config.policy_description(&spec())).unwrap();
         let mut algorithm = Algorithm::new(&config, &policy, None).unwrap();
         assert_eq!(algorithm.replica.is_some(), config.updates_by_graph());
         let shape = algorithm.batch_shape();

@@ -127,7 +127,8 @@ impl Ndp {
         let settings = config.algorithm.ndp.clone();
         let mut random = seeds::stream(config.run.seed, "actor parameters", 0);
         let mut initial = policy.initial_parameters(&mut random);
-        let initial_log_std = initial.split_off(policy.shape().parameters_len());
+        let mut initial_log_std = initial.split_off(policy.shape().parameters_len());
+        initial_log_std.fill(settings.initial_log_std as f32);
         let dims = initial_log_std.len();
         let rate = config.algorithm.actor_learning_rate;
         let critic_rate = config.algorithm.critic_learning_rate;

@@ -35,7 +35,7 @@ fn case_with(keys: &[(&str, &str)], rule: Option<GoalRule>) -> Case {
         layers.set("test", key, value).unwrap();
     }
     let config = layers.finish().unwrap();
-    let policy = Policy::new(&config, &spec()).unwrap();
+    let policy = Policy::new(config.policy_description(&spec())).unwrap();
     let mut algorithm = Algorithm::new(&config, &policy, rule.as_ref()).unwrap();
     // Targets differ from their networks, so that confusing them fails the test. Gains and shifts
     // differ from one and zero.

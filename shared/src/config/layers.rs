@@ -3,7 +3,7 @@
 use thiserror::Error;
 use toml::{Table, Value};
 
-use super::ExperimentConfig;
+use super::{ExperimentConfig, RangeError};
 
 /// Maximum number of names in a dotted key; real keys have fewer.
 const KEY_NAMES_MAX: usize = 16;
@@ -33,15 +33,8 @@ pub enum ConfigError {
         message: String,
     },
     /// A value out of range, or one that conflicts with another value.
-    #[error("`{key}` = {got}: {expected}")]
-    Range {
-        /// The dotted key.
-        key: &'static str,
-        /// The condition that the value must meet.
-        expected: String,
-        /// The rejected value.
-        got: String,
-    },
+    #[error(transparent)]
+    Range(#[from] RangeError),
 }
 
 /// The configuration layers merged so far.

@@ -7,20 +7,24 @@
 //! system is in this folder.
 
 mod algorithm;
+mod algorithm_name;
 mod dmp;
 pub mod endpoint;
 mod experiment;
 mod layers;
+mod policy_check;
 mod presets;
 mod randomise;
+mod range;
 mod resolve;
 mod task;
 mod tasks;
 
 pub use algorithm::{
-    AlgorithmConfig, AlgorithmName, CriticInput, ExplorationConfig, ExplorationKind,
-    LearningRateDecay, NdpConfig, SacConfig, Target, Td3Config, TqcConfig, WarmUpKind, Windows,
+    AlgorithmConfig, CriticInput, ExplorationConfig, ExplorationKind, LearningRateDecay, NdpConfig,
+    SacConfig, Target, Td3Config, TqcConfig, WarmUpKind, Windows,
 };
+pub use algorithm_name::AlgorithmName;
 pub use dmp::{
     BasisWidths, CanonicalIntegration, Controller, DmpConfig, ForcingScaling, Integrator,
     PolicyConfig, PolicyKind, RhoKind, Start, StartSource, StartVelocity,
@@ -33,6 +37,7 @@ pub use experiment::{
 pub use layers::{ConfigError, Layers, nearest};
 pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults, suitable_preset};
 pub use randomise::RandomiseConfig;
+pub use range::{RangeError, range};
 pub use resolve::Limits;
 pub use task::{TaskConfig, is_python_object};
 pub use tasks::{TASKS, TaskDefaults, task_defaults};

@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::ConfigError;
+use super::RangeError;
 
 /// Limits of the factors, which exclude a mass of zero.
 const FACTOR_MIN: f64 = 0.01;
@@ -58,7 +58,7 @@ impl RandomiseConfig {
     }
 
     /// Checks every range; only the environment knows which keys it supports.
-    pub(super) fn check(&self) -> Result<(), ConfigError> {
+    pub(super) fn check(&self) -> Result<(), RangeError> {
         for (key, range) in [
             ("task.randomise.mass", self.mass),
             ("task.randomise.friction", self.friction),
@@ -79,19 +79,18 @@ fn check<T: PartialOrd + std::fmt::Debug>(
     key: &'static str,
     range: [T; 2],
     limits: [T; 2],
-) -> Result<(), ConfigError> {
+) -> Result<(), RangeError> {
     if limits[0] <= range[0] && range[0] <= range[1] && range[1] <= limits[1] {
         return Ok(());
     }
     let [low, high] = limits;
     let expected = format!("expected [low, high], low <= high, from {low:?} to {high:?}");
-    Err(ConfigError::Range { key, expected, got: format!("{range:?}") })
+    Err(RangeError { key, expected, got: format!("{range:?}") })
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::{ExperimentConfig, Layers, Limits};
-    use super::*;
+    use super::super::{ConfigError, ExperimentConfig, Layers, Limits};
 
     fn layered(key: &str, value: &str) -> Result<ExperimentConfig, ConfigError> {
         let mut layers = Layers::new();

@@ -3,9 +3,10 @@
 mod algorithms;
 
 use super::endpoint::{is_endpoint, is_plain};
+use super::policy_check::check_hidden;
 use super::{
-    AlgorithmName, ConfigError, Controller, CriticInput, DeliveryLevel, ExperimentConfig,
-    PolicyKind, Start, WarmUpKind, Windows,
+    AlgorithmName, ConfigError, CriticInput, DeliveryLevel, ExperimentConfig, PolicyKind,
+    RangeError, Start, WarmUpKind, Windows, range,
 };
 
 /// Properties of the machine, passed in by the caller.
@@ -18,10 +19,7 @@ pub struct Limits {
 /// No experiment needs more; a larger value is probably a typo.
 const WORKERS_MAX: usize = 1_024;
 const ENVS_PER_WORKER_MAX: usize = 4_096;
-/// A replay slot stores its number of steps in one byte.
-const SEGMENT_STEPS_MAX: usize = 255;
 const HINDSIGHT_COPIES_MAX: usize = 64;
-const HIDDEN_MAX: usize = 65_536;
 /// Enough for a worker that sends 100 000 segments per second and gets 100 acknowledgements per
 /// second. At higher rates the learner acknowledges more often.
 const SEGMENTS_UNTIL_ACKNOWLEDGED: usize = 1_024;
@@ -67,12 +65,10 @@ impl ExperimentConfig {
             self.algorithm.ndp.rollout_segments = envs.saturating_mul(ROLLOUT_SEGMENTS_PER_ENV);
         }
         self.task.check()?;
+        self.policy.check(&self.dmp, self.algorithm.name)?;
         self.check_counts()?;
         self.check_numbers()?;
         self.check_goals()?;
-        if self.policy.kind == PolicyKind::Dmp {
-            self.check_dmp()?;
-        }
         self.check_combinations()?;
         self.check_ndp()?;
         self.check_tqc()?;
@@ -83,7 +79,7 @@ impl ExperimentConfig {
         Ok(self)
     }
 
-    fn check_delivery(&self) -> Result<(), ConfigError> {
+    fn check_delivery(&self) -> Result<(), RangeError> {
         let log = self.delivery.level == DeliveryLevel::Log;
         range("delivery.level", "log", !(log && self.run.deterministic), || {
             "memory with run.deterministic, which runs in one process and sends no segments".into()
@@ -94,7 +90,7 @@ impl ExperimentConfig {
         })
     }
 
-    fn check_bridge(&self) -> Result<(), ConfigError> {
+    fn check_bridge(&self) -> Result<(), RangeError> {
         for endpoint in &self.bridge.listen {
             range("bridge.listen", endpoint, is_endpoint(endpoint), || {
                 "tls/ADDRESS:PORT or tcp/ADDRESS:PORT, such as tls/0.0.0.0:7447".into()
@@ -111,7 +107,7 @@ impl ExperimentConfig {
         })
     }
 
-    fn check_counts(&self) -> Result<(), ConfigError> {
+    fn check_counts(&self) -> Result<(), RangeError> {
         let counts = [
             ("actors.workers", self.actors.workers, 1, WORKERS_MAX),
             ("actors.joined_max", self.actors.joined_max, 0, WORKERS_MAX),
@@ -124,9 +120,6 @@ impl ExperimentConfig {
                 1,
                 UNACKNOWLEDGED_MAX,
             ),
-            ("policy.segment_steps", self.policy.segment_steps, 1, SEGMENT_STEPS_MAX),
-            ("dmp.basis_count", self.dmp.basis_count, 1, 256),
-            ("dmp.integration_steps", self.dmp.integration_steps, 1, 100_000),
             ("algorithm.batch_size", self.algorithm.batch_size, 1, 1 << 20),
             ("replay.capacity_steps", self.replay.capacity_steps, 1_000, 1 << 31),
             ("replay.hindsight_copies", self.replay.hindsight_copies, 1, HINDSIGHT_COPIES_MAX),
@@ -138,17 +131,7 @@ impl ExperimentConfig {
         for (key, got, low, high) in counts {
             range(key, got, (low..=high).contains(&got), || format!("from {low} to {high}"))?;
         }
-        let layers = [
-            ("policy.hidden", &self.policy.hidden),
-            ("algorithm.critic_hidden", &self.algorithm.critic_hidden),
-        ];
-        for (key, hidden) in layers {
-            let fits = !hidden.is_empty()
-                && hidden.len() <= 16
-                && hidden.iter().all(|&width| (1..=HIDDEN_MAX).contains(&width));
-            let got = format!("{hidden:?}");
-            range(key, got, fits, || format!("1 to 16 widths from 1 to {HIDDEN_MAX}"))?;
-        }
+        check_hidden("algorithm.critic_hidden", &self.algorithm.critic_hidden)?;
         let intervals = [
             ("run.steps", self.run.steps),
             ("evaluation.interval_steps", self.evaluation.interval_steps),
@@ -162,7 +145,7 @@ impl ExperimentConfig {
             .try_for_each(|&(key, got)| range(key, got, got > 0, || "at least 1".into()))
     }
 
-    fn check_numbers(&self) -> Result<(), ConfigError> {
+    fn check_numbers(&self) -> Result<(), RangeError> {
         let positive = [
             ("algorithm.critic_learning_rate", self.algorithm.critic_learning_rate),
             ("algorithm.actor_learning_rate", self.algorithm.actor_learning_rate),
@@ -172,11 +155,6 @@ impl ExperimentConfig {
                 "algorithm.sac.temperature_learning_rate",
                 self.algorithm.sac.temperature_learning_rate,
             ),
-            ("policy.goal_range", self.policy.goal_range),
-            ("policy.weight_range", self.policy.weight_range),
-            ("policy.rho_range", self.policy.rho_range),
-            ("dmp.alpha_x", self.dmp.alpha_x),
-            ("dmp.alpha_y", self.dmp.alpha_y),
         ];
         for (key, got) in positive {
             range(key, got, got.is_finite() && got > 0.0, || "a positive number".into())?;
@@ -212,7 +190,6 @@ impl ExperimentConfig {
             ("algorithm.discount", self.algorithm.discount),
             ("algorithm.polyak", self.algorithm.polyak),
             ("exploration.warm_up_range", self.exploration.warm_up_range),
-            ("policy.action_range", self.policy.action_range),
         ];
         for (key, got) in unit {
             range(key, got, got > 0.0 && got <= 1.0, || "above 0, at most 1".into())?;
@@ -232,7 +209,7 @@ impl ExperimentConfig {
         range("run.max_minutes", minutes, minutes > 0.0, || "above 0 (inf: no limit)".into())
     }
 
-    fn check_goals(&self) -> Result<(), ConfigError> {
+    fn check_goals(&self) -> Result<(), RangeError> {
         let random = self.exploration.random_segments;
         let shares = [
             ("replay.hindsight_share", self.replay.hindsight_share),
@@ -259,25 +236,7 @@ impl ExperimentConfig {
         })
     }
 
-    fn check_dmp(&self) -> Result<(), ConfigError> {
-        let (dmp, steps) = (&self.dmp, self.policy.segment_steps);
-        range(
-            "dmp.integration_steps",
-            dmp.integration_steps,
-            dmp.integration_steps.is_multiple_of(steps),
-            || format!("a multiple of policy.segment_steps = {steps}"),
-        )?;
-        let max = dmp.integrator.alpha_y_max(1.0 / dmp.integration_steps as f64);
-        range("dmp.alpha_y", dmp.alpha_y, dmp.alpha_y < max, || {
-            format!(
-                "less than {max:.0}, the stability limit of the {:?} integrator with {} steps; \
-                     lower alpha_y or raise dmp.integration_steps",
-                dmp.integrator, dmp.integration_steps
-            )
-        })
-    }
-
-    fn check_combinations(&self) -> Result<(), ConfigError> {
+    fn check_combinations(&self) -> Result<(), RangeError> {
         let first = self.algorithm.critic == CriticInput::First;
         let sliding = self.algorithm.windows == Windows::Sliding;
         let several = self.policy.decision_steps() > 1;
@@ -311,12 +270,6 @@ impl ExperimentConfig {
             "zero, observed or action with demonstrations, which do not contain the state of a DMP"
                 .into()
         })?;
-        let position = dmp && self.policy.controller == Controller::Position;
-        range("policy.start", "action", !(position && self.policy.follows_actions()), || {
-            "another start with policy.controller = \"position\", whose actions are no positions, \
-             or another controller"
-                .into()
-        })?;
         let observed = dmp && self.policy.start == Start::Observed;
         let sources = self.task.start_sources.len();
         range("policy.start", "observed", !observed || sources > 0, || {
@@ -326,19 +279,6 @@ impl ExperimentConfig {
             )
         })
     }
-}
-
-fn range(
-    key: &'static str,
-    got: impl std::fmt::Display,
-    fits: bool,
-    expected: impl FnOnce() -> String,
-) -> Result<(), ConfigError> {
-    if fits {
-        return Ok(());
-    }
-    let expected = expected();
-    Err(ConfigError::Range { key, expected: format!("expected {expected}"), got: got.to_string() })
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use super::{ConfigError, RandomiseConfig, StartSource};
+use super::{RandomiseConfig, RangeError, StartSource};
 
 /// The environment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -93,10 +93,10 @@ impl TaskConfig {
     }
 
     /// Checks names and ranges; only the environment knows which arguments are valid.
-    pub(super) fn check(&self) -> Result<(), ConfigError> {
+    pub(super) fn check(&self) -> Result<(), RangeError> {
         let range = |key, expected: &str, got: &str| {
             let expected = format!("expected {expected}");
-            Err(ConfigError::Range { key, expected, got: got.to_owned() })
+            Err(RangeError { key, expected, got: got.to_owned() })
         };
         if let Some(name) = self.wrappers.iter().find(|name| !is_python_object(name)) {
             return range("task.wrappers", "module:function or module:Class", name);
@@ -137,7 +137,7 @@ fn has_nan(value: &Value) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{ExperimentConfig, Layers, Limits};
+    use super::super::{ConfigError, ExperimentConfig, Layers, Limits};
     use super::*;
 
     fn layered(settings: &[(&str, &str)]) -> Result<ExperimentConfig, ConfigError> {

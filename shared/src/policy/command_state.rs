@@ -66,7 +66,7 @@ mod tests {
             observation_names: Vec::new(),
             goal_rule: None,
         };
-        let policy = Policy::new(&layers.finish().unwrap(), &spec).unwrap();
+        let policy = Policy::new(layers.finish().unwrap().policy_description(&spec)).unwrap();
         let mut parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         parameters.iter_mut().for_each(|parameter| *parameter *= 3.0);
         let mut work = policy.workspace(1);
@@ -94,7 +94,7 @@ mod tests {
     /// times as many steps the jumps are about 16 times smaller, or more.
     #[test]
     fn action_and_its_rate_are_continuous_across_segments_and_at_the_start_of_an_episode() {
-        let (coarse, fine) = (jumps(40), jumps(640));
+        let (coarse, fine) = (jumps(15), jumps(240));
         for (coarse, fine) in coarse.into_iter().zip(fine) {
             assert!(coarse > 1e-3, "actions of nothing: {coarse}");
             assert!(coarse > 8.0 * fine, "{coarse} {fine}");

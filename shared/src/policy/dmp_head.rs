@@ -4,12 +4,10 @@
 //! g = goal_range t, w = weight_range omega² t, and rho = (1, 0, 0, 0) + rho_range t. With
 //! `rho = "free"`, rho = (1, 0, 0, 0) + output. Other controllers than `inverse` have no rho.
 
-use super::PolicyError;
 use super::start::StartState;
-use super::tanh;
-use crate::config::{Controller, ExperimentConfig, RhoKind};
+use super::{PolicyDescription, PolicyError, tanh};
+use crate::config::{Controller, RhoKind};
 use crate::dmp::{Dmp, SegmentMap, act, act_backward, act_position, act_position_backward};
-use crate::spec::EnvSpec;
 
 /// Number of inverse-controller parameters per dimension.
 const RHO_LEN: usize = 4;
@@ -62,25 +60,26 @@ pub struct HeadGradient<'a> {
 }
 
 impl DmpHead {
-    /// Creates the head that `config` describes.
+    /// Creates the head of the described policy.
     ///
     /// # Errors
     /// If the DMP's configuration is invalid, or `task.start_sources` does not fit the environment.
-    pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
-        let dmp = Dmp::new(&config.dmp, config.policy.segment_steps)?;
-        let weight_scale = config.policy.weight_range * dmp.omega() * dmp.omega();
+    pub fn new(description: &PolicyDescription) -> Result<Self, PolicyError> {
+        let PolicyDescription { spec, policy, .. } = description;
+        let dmp = Dmp::new(&description.dmp, policy.segment_steps)?;
+        let weight_scale = policy.weight_range * dmp.omega() * dmp.omega();
         Ok(Self {
             map: SegmentMap::new(&dmp, weight_scale),
-            start: StartState::new(config, spec)?,
-            observation_len: spec.observation_len + config.policy.state_len(spec.action_len),
+            start: StartState::new(description)?,
+            observation_len: spec.observation_len + policy.state_len(spec.action_len),
             dims: spec.action_len,
-            steps: config.policy.segment_steps,
-            basis_count: config.dmp.basis_count,
-            goal_range: config.policy.goal_range as f32,
-            controller: config.policy.controller,
-            position_scale: config.policy.position_scale as f32,
-            rho: config.policy.rho,
-            rho_range: config.policy.rho_range as f32,
+            steps: policy.segment_steps,
+            basis_count: description.dmp.basis_count,
+            goal_range: policy.goal_range as f32,
+            controller: policy.controller,
+            position_scale: policy.position_scale as f32,
+            rho: policy.rho,
+            rho_range: policy.rho_range as f32,
             omega: dmp.omega() as f32,
         })
     }

@@ -6,23 +6,20 @@
 //! Draws are not bounded. Segments contain the unclipped draw, because learning needs its
 //! probability. The environment receives it clipped to the action's bounds.
 
-use crate::config::{AlgorithmName, ExperimentConfig};
-use crate::spec::EnvSpec;
+use super::PolicyDescription;
+use crate::config::AlgorithmName;
 
-/// Position and initial value of the logarithms.
+/// Position of the logarithms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearnedStd {
     dims: usize,
-    initial_log_std: f32,
 }
 
 impl LearnedStd {
     /// Creates the distribution, or `None` if the algorithm does not use it.
-    pub(super) fn of(config: &ExperimentConfig, spec: &EnvSpec) -> Option<Self> {
-        (config.algorithm.name == AlgorithmName::Ndp).then_some(Self {
-            dims: spec.action_len,
-            initial_log_std: config.algorithm.ndp.initial_log_std as f32,
-        })
+    pub(super) fn of(description: &PolicyDescription) -> Option<Self> {
+        let dims = description.spec.action_len;
+        (description.algorithm == AlgorithmName::Ndp).then_some(Self { dims })
     }
 
     /// Number of parameters, A.
@@ -30,10 +27,6 @@ impl LearnedStd {
     #[expect(clippy::len_without_is_empty, reason = "an action has at least one dimension")]
     pub fn len(&self) -> usize {
         self.dims
-    }
-
-    pub(super) fn initial(&self) -> f32 {
-        self.initial_log_std
     }
 
     /// Returns the logarithms, (A,), of a policy's flat parameters, (P,).

@@ -40,10 +40,10 @@ pub use matrix::{Keep, Matrix, product};
 pub use network::{Activations, Layer, MlpShape, SmallBatchNetwork, forward, initial_parameters};
 pub use tanh::tanh;
 
-use crate::config::{ConfigError, Controller, ExperimentConfig, PolicyKind};
+use crate::config::{Controller, PolicyKind, RangeError};
 use crate::dmp::DmpError;
 use crate::segment::{ActionBounds, SegmentLayout};
-use crate::spec::{EnvSpec, SpecError};
+use crate::spec::SpecError;
 
 /// Why a policy cannot be built.
 #[derive(Debug, Error)]
@@ -56,7 +56,7 @@ pub enum PolicyError {
     Dmp(#[from] DmpError),
     /// A value of a policy description is out of range.
     #[error(transparent)]
-    Config(#[from] ConfigError),
+    Range(#[from] RangeError),
     /// `task.start_sources` does not fit the environment.
     #[error("task.start_sources: {0}")]
     StartSources(String),
@@ -112,44 +112,47 @@ pub struct PolicyWorkspace {
 }
 
 impl Policy {
-    /// Builds the policy that `config` describes, for one environment.
+    /// Builds the described policy. Checks every value, because the description may come from an
+    /// untrusted file.
     ///
     /// # Errors
-    /// If the environment's spec is invalid or does not fit the configuration.
-    pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
-        spec.check()?;
-        let steps = config.policy.decision_steps();
+    /// If a value is out of range or does not fit the environment.
+    pub fn new(mut description: PolicyDescription) -> Result<Self, PolicyError> {
+        description.spec.check()?;
+        description.policy.check(&description.dmp, description.algorithm)?;
+        // A policy acts without knowing rewards.
+        description.spec.goal_rule = None;
+        let PolicyDescription { spec, algorithm, policy, .. } = &description;
+        let steps = policy.decision_steps();
         let layout = SegmentLayout {
             segment_steps: steps,
-            observation_len: spec.observation_len + config.policy.state_len(spec.action_len),
+            observation_len: spec.observation_len + policy.state_len(spec.action_len),
             action_len: spec.action_len,
         };
-        let head = match config.policy.kind {
+        let head = match policy.kind {
             PolicyKind::Mlp | PolicyKind::Chunk => Head::Mlp,
-            PolicyKind::Dmp => Head::Dmp(Box::new(DmpHead::new(config, spec)?)),
+            PolicyKind::Dmp => Head::Dmp(Box::new(DmpHead::new(&description)?)),
         };
         let head_outputs = match &head {
             Head::Mlp => layout.actions_len(),
             Head::Dmp(head) => head.outputs_len(),
         };
-        let gaussian = config.algorithm.name.has_gaussian_policy();
-        let outputs = head_outputs + if gaussian { layout.actions_len() } else { 0 };
+        let log_stds = if algorithm.has_gaussian_policy() { layout.actions_len() } else { 0 };
         let mut widths = vec![layout.observation_len];
-        widths.extend(&config.policy.hidden);
-        widths.push(outputs);
+        widths.extend(&policy.hidden);
+        widths.push(head_outputs + log_stds);
         Ok(Self {
             shape: MlpShape::new(widths),
-            learned_std: LearnedStd::of(config, spec),
-            squashes: config.policy.kind != PolicyKind::Dmp
-                || config.policy.controller != Controller::Position,
+            learned_std: LearnedStd::of(&description),
+            squashes: policy.kind != PolicyKind::Dmp || policy.controller != Controller::Position,
             head,
             head_outputs,
             layout,
-            scaling: ActionScaling::new(spec, config.policy.action_range),
+            scaling: ActionScaling::new(spec, policy.action_range),
             env_observation_len: spec.observation_len,
-            command_state: config.policy.follows_actions().then(|| CommandState::new(steps)),
-            architecture_hash: architecture::hash(config, spec),
-            description: PolicyDescription::new(config, spec),
+            command_state: policy.follows_actions().then(|| CommandState::new(steps)),
+            architecture_hash: architecture::hash(&description),
+            description,
         })
     }
 
@@ -247,13 +250,11 @@ impl Policy {
         self.state_len() > 0 && self.command_state.is_none()
     }
 
-    /// Draws initial parameters.
+    /// Draws initial parameters. Learned standard deviations are 1.
     #[must_use]
     pub fn initial_parameters(&self, random: &mut Xoshiro256PlusPlus) -> Vec<f32> {
         let mut parameters = initial_parameters(&self.shape, random);
-        if let Some(learned) = &self.learned_std {
-            parameters.extend(std::iter::repeat_n(learned.initial(), learned.len()));
-        }
+        parameters.resize(self.parameters_len(), 0.0);
         parameters
     }
 

@@ -1,7 +1,7 @@
 //! Initial state (y0, yd0) of a segment's DMP, for every action dimension.
 
-use super::PolicyError;
-use crate::config::{ExperimentConfig, Start, StartSource, StartVelocity};
+use super::{PolicyDescription, PolicyError};
+use crate::config::{Start, StartSource, StartVelocity};
 use crate::spec::EnvSpec;
 
 /// Source of (y0, yd0).
@@ -26,21 +26,21 @@ pub enum StartState {
 }
 
 impl StartState {
-    /// Creates the source that the configuration describes.
+    /// Creates the source of the described policy.
     ///
     /// # Errors
     /// `StartSources` if `task.start_sources` does not fit the environment.
-    pub fn new(config: &ExperimentConfig, spec: &EnvSpec) -> Result<Self, PolicyError> {
-        match config.policy.start {
+    pub fn new(description: &PolicyDescription) -> Result<Self, PolicyError> {
+        let PolicyDescription { spec, policy, start_sources, .. } = description;
+        match policy.start {
             Start::Zero => Ok(Self::Zero),
             Start::Carry | Start::Action => Ok(Self::Appended { at: spec.observation_len }),
             Start::Observed => {
-                let sources = config.task.start_sources.clone();
-                check(&sources, spec)?;
-                let segment_s = config.policy.segment_steps as f64 * spec.control_dt_s;
-                let measured = config.policy.start_velocity == StartVelocity::Measured;
+                check(start_sources, spec)?;
+                let segment_s = policy.segment_steps as f64 * spec.control_dt_s;
+                let measured = policy.start_velocity == StartVelocity::Measured;
                 let velocity_scale = if measured { segment_s as f32 } else { 0.0 };
-                Ok(Self::Observed { sources, velocity_scale })
+                Ok(Self::Observed { sources: start_sources.clone(), velocity_scale })
             }
         }
     }

@@ -24,21 +24,22 @@ fn policy(keys: &[(&str, &str)]) -> Policy {
         layers.set("test", key, value).unwrap();
     }
     let config: ExperimentConfig = layers.finish().unwrap();
-    Policy::new(&config, &spec()).unwrap()
+    Policy::new(config.policy_description(&spec())).unwrap()
 }
 
 #[test]
 fn stochastic_policy_keeps_its_standard_deviations() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("1.safetensors");
-    let own = policy(&[("algorithm.name", "ndp"), ("algorithm.ndp.initial_log_std", "-0.5")]);
-    let mut random = crate::seeds::stream(1, "test", 0);
+    let own = policy(&[("algorithm.name", "ndp")]);
+    let mut values = own.initial_parameters(&mut crate::seeds::stream(1, "test", 0));
+    values[own.shape().parameters_len()..].fill(-0.5);
     let snapshot = ParameterSnapshot {
         version: 1,
         env_steps: 0,
         architecture_hash: own.architecture_hash(),
         settled: false,
-        values: own.initial_parameters(&mut random),
+        values,
     };
     fs::write(&path, encode(&own, &snapshot, None, None).unwrap()).unwrap();
     let read = load(&path, &own, Match::Architecture).unwrap();
@@ -116,6 +117,7 @@ fn policy_is_restored_from_the_file_alone() {
         &[("policy.start", "carry"), ("dmp.alpha_y", "12.5"), ("policy.rho", "free")],
         &[("policy.start", "observed"), ("task.start_sources", sources)],
         &[("policy.start", "action"), ("policy.controller", "direct")],
+        &[("task.kwargs.reward_type", "dense"), ("task.wrappers", "[\"module:name\"]")],
     ] {
         let (own, snapshot, origin) = saved(keys, &path);
         let opened = open(&path).unwrap();

@@ -32,7 +32,7 @@ fn policy(keys: &[(&str, &str)]) -> Policy {
         layers.set("test", key, value).unwrap();
     }
     let config: ExperimentConfig = layers.finish().unwrap();
-    Policy::new(&config, &spec()).unwrap()
+    Policy::new(config.policy_description(&spec())).unwrap()
 }
 
 /// Creates a runtime with scaled-up parameters, so that actions differ from step to step.

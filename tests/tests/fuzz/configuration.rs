@@ -132,7 +132,7 @@ fn use_as_a_run_does(config: &ExperimentConfig) {
     config.policy.hidden = vec![4];
     if config.dmp.integration_steps <= INTEGRATION_STEPS_MAX {
         // It may not fit the environment, which has four observations and two actions.
-        let _ = Policy::new(&config, &fixture::spec());
+        let _ = Policy::new(config.policy_description(&fixture::spec()));
     }
 }
 

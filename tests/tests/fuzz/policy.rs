@@ -18,7 +18,7 @@ fn one_that_is_accepted_is_finite_and_stays_what_it_is() {
     };
     let folder = fixture::folder();
     let path = folder.path().join("1.safetensors");
-    let policy = Policy::new(&fixture::config(&[]), &fixture::spec()).unwrap();
+    let policy = Policy::new(fixture::config(&[]).policy_description(&fixture::spec())).unwrap();
     let made = [1, 2].map(|version| {
         let values = policy.initial_parameters(&mut dmprl_shared::seeds::stream(version, "p", 0));
         let architecture_hash = policy.architecture_hash();

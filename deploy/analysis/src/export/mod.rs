@@ -25,7 +25,7 @@ pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<
         format!("run {} has not started an environment yet", run.path().display())
     })?;
     // Uses the run's configuration, because policy files of older versions have no description.
-    let policy = Policy::new(&config, &spec)?;
+    let policy = Policy::new(config.policy_description(&spec))?;
     let snapshot = policy_file::load(&chosen.path, &policy, Match::Architecture)?;
     let this = Session::now();
     let origin = Origin {

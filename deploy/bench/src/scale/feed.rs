@@ -81,7 +81,8 @@ impl FeedPlan<'_> {
 
     /// Returns the size of a segment, header plus block.
     pub(super) fn segment_bytes(&self) -> anyhow::Result<usize> {
-        let block_len = Policy::new(self.config, self.spec)?.layout().block_len();
+        let block_len =
+            Policy::new(self.config.policy_description(self.spec))?.layout().block_len();
         Ok(size_of::<SegmentHeader>() + block_len * size_of::<f32>())
     }
 }

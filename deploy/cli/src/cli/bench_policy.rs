@@ -104,7 +104,7 @@ fn opened(args: &PolicyArgs) -> anyhow::Result<OpenedPolicy> {
     };
     let sources = args.configured.sources(name, [])?;
     let config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
-    let policy = Policy::new(&config, &task.spec())?;
+    let policy = Policy::new(config.policy_description(&task.spec()))?;
     let values = policy.initial_parameters(&mut seeds::stream(config.run.seed, "policy", 0));
     let architecture_hash = policy.architecture_hash();
     let snapshot =

@@ -88,7 +88,7 @@ pub fn run(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<()> {
 fn open(args: &GatewayArgs, control: &ControlPipe) -> anyhow::Result<Option<Gateway>> {
     let setup = Setup::read(&args.run)?;
     let spec = setup.run.spec()?.context("the run has no spec.json; a worker writes it first")?;
-    let policy = Policy::new(&setup.config, &spec)?;
+    let policy = Policy::new(setup.config.policy_description(&spec))?;
     let (config, bridge) = (&setup.config, &setup.config.bridge);
     let facts = RunFacts {
         run_id: setup.run.manifest()?.run_id,

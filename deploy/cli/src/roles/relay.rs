@@ -47,7 +47,7 @@ pub fn run(args: &RelayArgs, control: &ControlPipe) -> anyhow::Result<()> {
 fn start(args: &RelayArgs) -> anyhow::Result<Relay> {
     let setup = Setup::read(&args.run)?;
     let spec = setup.run.spec()?.context("the run has no spec.json: start the bridge again")?;
-    let policy = Policy::new(&setup.config, &spec)?;
+    let policy = Policy::new(setup.config.policy_description(&spec))?;
     let plan = Plan::new(&setup.config, setup.run_id, &policy);
     let join = JoinSettings {
         endpoint: args.connect.clone(),

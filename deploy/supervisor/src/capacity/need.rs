@@ -50,7 +50,7 @@ impl Need {
     pub fn of(config: &ExperimentConfig, spec: Option<&EnvSpec>) -> Self {
         // An environment that contradicts the configuration is rejected elsewhere, with a specific
         // error.
-        let policy = spec.and_then(|spec| Policy::new(config, spec).ok());
+        let policy = spec.and_then(|spec| Policy::new(config.policy_description(spec)).ok());
         let smallest = SegmentLayout {
             segment_steps: config.policy.decision_steps(),
             observation_len: 1,

@@ -53,7 +53,7 @@ fn a_rollout_and_its_updates_equal_those_of_an_independent_implementation() {
     let mut golden = Golden::read(&folder().join("ndp.safetensors"));
     let mut config = golden.config();
     config.learner.threads = 2;
-    let policy = Policy::new(&config, &spec()).unwrap();
+    let policy = Policy::new(config.policy_description(&spec())).unwrap();
     let mut ndp = Ndp::new(&config, &policy).unwrap();
     let networks =
         [("actor", &mut ndp.actor), ("log_std", &mut ndp.log_std), ("critic", &mut ndp.critic)];

@@ -60,7 +60,7 @@ fn case(keys: &[(&str, &str)]) -> Case {
         layers.set("test", key, value).unwrap();
     }
     let config = layers.finish().unwrap();
-    let policy = Policy::new(&config, &spec()).unwrap();
+    let policy = Policy::new(config.policy_description(&spec())).unwrap();
     let mut ndp = Ndp::new(&config, &policy).unwrap();
     ndp.policy_published(1);
     Case { config, policy, ndp, random: seeds::stream(3, "test", 0) }

@@ -1,15 +1,14 @@
 //! Checks of the algorithms' own settings and of what computes their updates.
 
-use super::range;
 use crate::config::{
-    AlgorithmName, Backend, ConfigError, Controller, Device, ExperimentConfig, Hindsight,
-    PolicyKind, Precision, TqcConfig,
+    AlgorithmName, Backend, Device, ExperimentConfig, Hindsight, Precision, RangeError, TqcConfig,
+    range,
 };
 
 const QUANTILES_MAX: usize = 200;
 
 impl ExperimentConfig {
-    pub(super) fn check_ndp(&self) -> Result<(), ConfigError> {
+    pub(super) fn check_ndp(&self) -> Result<(), RangeError> {
         let ndp = &self.algorithm.ndp;
         let counts = [
             ("algorithm.ndp.rollout_segments", ndp.rollout_segments, 1 << 24),
@@ -22,7 +21,6 @@ impl ExperimentConfig {
         let positive = [
             ("algorithm.ndp.clip", ndp.clip),
             ("algorithm.ndp.gradient_norm_max", ndp.gradient_norm_max),
-            ("policy.position_scale", self.policy.position_scale),
         ];
         for (key, got) in positive {
             range(key, got, got.is_finite() && got > 0.0, || "a positive number".into())?;
@@ -37,10 +35,6 @@ impl ExperimentConfig {
         let fits = (-10.0..=2.0).contains(&log_std);
         range("algorithm.ndp.initial_log_std", log_std, fits, || "from -10 to 2".into())?;
         let on_policy = self.algorithm.name == AlgorithmName::Ndp;
-        let kind = self.policy.kind;
-        range("policy.kind", kind.name(), !on_policy || kind == PolicyKind::Dmp, || {
-            "dmp with algorithm.name = \"ndp\", which learns only movement primitives".into()
-        })?;
         let warm_up = self.exploration.warm_up_steps;
         range("exploration.warm_up_steps", warm_up, !on_policy || warm_up == 0, || {
             "0 with algorithm.name = \"ndp\", which learns only from actions of its own policy"
@@ -65,16 +59,10 @@ impl ExperimentConfig {
         let layer_norm = self.algorithm.critic_layer_norm;
         range("algorithm.critic_layer_norm", "true", !on_policy || !layer_norm, || {
             "false with algorithm.name = \"ndp\"; the other algorithms support it".into()
-        })?;
-        let position = self.policy.controller == Controller::Position;
-        let dmp = self.policy.kind == PolicyKind::Dmp;
-        range("policy.controller", "position", on_policy || !position || !dmp, || {
-            "inverse, or algorithm.name = \"ndp\", the only algorithm that clips unbounded actions"
-                .into()
         })
     }
 
-    pub(super) fn check_action_penalties(&self) -> Result<(), ConfigError> {
+    pub(super) fn check_action_penalties(&self) -> Result<(), RangeError> {
         let on_policy = self.algorithm.name == AlgorithmName::Ndp;
         for (key, penalty) in [
             ("algorithm.action_rate_penalty", self.algorithm.action_rate_penalty),
@@ -88,7 +76,7 @@ impl ExperimentConfig {
         Ok(())
     }
 
-    pub(super) fn check_tqc(&self) -> Result<(), ConfigError> {
+    pub(super) fn check_tqc(&self) -> Result<(), RangeError> {
         let tqc = &self.algorithm.tqc;
         let counts = [
             ("algorithm.tqc.critics", tqc.critics, TqcConfig::CRITICS_MAX),
@@ -104,7 +92,7 @@ impl ExperimentConfig {
     }
 
     /// Only the kernels have 16-bit products.
-    pub(super) fn check_backend(&self) -> Result<(), ConfigError> {
+    pub(super) fn check_backend(&self) -> Result<(), RangeError> {
         let kernels = self.learner.backend == Backend::Kernels;
         range("learner.backend", "kernels", !kernels || self.has_kernels(), || {
             "auto or graph: there are kernels only for ddpg, td3, sac and ndp on the CPU".into()

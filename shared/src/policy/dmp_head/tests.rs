@@ -5,6 +5,7 @@ use rand::RngExt;
 use super::*;
 use crate::config::Layers;
 use crate::seeds;
+use crate::spec::EnvSpec;
 
 const ROWS: usize = 3;
 
@@ -26,7 +27,7 @@ fn head(keys: &[(&str, &str)]) -> DmpHead {
         observation_names: Vec::new(),
         goal_rule: None,
     };
-    DmpHead::new(&layers.finish().unwrap(), &spec).unwrap()
+    DmpHead::new(&layers.finish().unwrap().policy_description(&spec)).unwrap()
 }
 
 #[test]
