@@ -12,11 +12,13 @@ const ROOT: &str = "../..";
 
 /// Sources of the program, relative to the project's root, without documentation and tests. The
 /// Python package is not compiled in; a run's manifest has its hash.
-const SOURCES: [&str; 21] = [
+const SOURCES: [&str; 23] = [
     "Cargo.toml",
     "Cargo.lock",
     "shared/Cargo.toml",
     "shared/src",
+    "shared/runtime/Cargo.toml",
+    "shared/runtime/src",
     "actors/Cargo.toml",
     "actors/build.rs",
     "actors/src",

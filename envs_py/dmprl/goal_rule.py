@@ -1,8 +1,8 @@
 """Finds the rule by which an environment rewards goals, and proves it.
 
 With such a rule the learner computes the reward of any step for any goal, without Python
-(``shared/src/goal_rule.rs``). An environment can declare its rule; otherwise it is fitted by
-probing :meth:`SegmentEnv.relabel`. In both cases the rule is used only if it agrees with the
+(``shared/runtime/src/goal_rule.rs``). An environment can declare its rule; otherwise it is fitted
+by probing :meth:`SegmentEnv.relabel`. In both cases the rule is used only if it agrees with the
 environment on pairs of goals, many of them near the threshold.
 """
 

@@ -1,6 +1,7 @@
-"""The command that holds a robot, in the robot's own terms; ``shared/src/policy/hold.rs`` in Rust.
+"""The command that holds a robot, in the robot's own terms.
 
-A policy has none by default, because the same numbers hold one robot and move another.
+A policy has none by default, because the same numbers hold one robot and move another. In Rust it
+is in ``shared/runtime/src/policy/hold.rs``.
 """
 
 from __future__ import annotations

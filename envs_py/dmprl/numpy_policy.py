@@ -1,6 +1,6 @@
 """Computes the policy in NumPy, for use without Rust and as a peer in benchmarks.
 
-It computes the same function as ``shared/src/policy`` and the same noise as
+It computes the same function as ``shared/runtime/src/policy`` and the same noise as
 ``actors/src/exploration.rs``, for E environments at once; a test compares its actions with Rust's.
 :class:`dmprl.Policy` adds the policy file and a robot's safety limits. Shapes: E environments, K
 steps, O observation, A action, N basis functions.
@@ -103,7 +103,7 @@ class NumpyPolicy:
     def follow(self, u: Floats) -> None:
         """Advances the state by a step with actions ``u``, (E, A), if it is that of the commands.
 
-        See ``shared/src/policy/command_state.rs``.
+        See ``shared/runtime/src/policy/command_state.rs``.
         """
         if self._follows:
             y, yd = np.split(self.state, 2, axis=1)
@@ -135,7 +135,7 @@ def layers(widths: list[int], parameters: Floats) -> list[tuple[Floats, Floats]]
 
 
 class DmpHead:
-    """Maps the network's outputs to a segment of actions (``shared/src/policy/dmp_head.rs``)."""
+    """Maps the network's outputs to a segment, as in ``shared/runtime/src/policy/dmp_head.rs``."""
 
     def __init__(self, plan: dict) -> None:
         policy, dmp = plan["policy"], plan["dmp"]

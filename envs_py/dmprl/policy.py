@@ -6,8 +6,8 @@
     policy.reset()
     action = policy.action(observation)  # once per control step
 
-It behaves like ``shared/src/runtime`` in Rust; a test compares them. Shapes: K steps of a segment,
-O observation, A action.
+It behaves like ``shared/runtime/src/policy_runtime`` in Rust; a test compares them. Shapes: K steps
+of a segment, O observation, A action.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Checks a policy's description, like ``shared/src/policy/description.rs`` in Rust."""
+"""Checks a policy's description, like ``shared/runtime/src/policy/description.rs`` in Rust."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Reads a policy file: safetensors with the policy's description in its metadata.
 
 ``dmprl export`` and training (in a run's ``policies/``) write the files, with
-``shared/src/policy_file.rs``. Reading one needs only NumPy: the format is the header's length, the
-header in JSON, and the numbers.
+``shared/runtime/src/policy_file.rs``. Reading one needs only NumPy: the format is the header's
+length, the header in JSON, and the numbers.
 """
 
 from __future__ import annotations

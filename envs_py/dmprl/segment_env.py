@@ -58,7 +58,7 @@ class Goals(TypedDict):
 
 
 class EnvSpec(TypedDict):
-    """Properties of an environment that learner and policy need (``shared/src/spec.rs``)."""
+    """Properties of an environment that policies need (``shared/runtime/src/spec.rs``)."""
 
     id: str
     observation_len: int

@@ -10,11 +10,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use dmprl_analysis::export;
+use dmprl_runtime::PolicyRuntime;
 use dmprl_shared::config::{ExperimentConfig, Layers, Limits, task_defaults};
 use dmprl_shared::parameters::ParameterSnapshot;
 use dmprl_shared::policy::Policy;
 use dmprl_shared::policy_file::OpenedPolicy;
-use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_shared::seeds;
 use dmprl_shared::spec::EnvSpec;
 

@@ -12,8 +12,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use dmprl_analysis::export;
+use dmprl_runtime::{PolicyRuntime, RuntimeError};
 use dmprl_shared::policy::Hold;
-use dmprl_shared::runtime::{PolicyRuntime, RuntimeError};
 use dmprl_tests::exported::{self, KINDS, read_numbers, write_numbers};
 use dmprl_tests::{project_root, venv};
 

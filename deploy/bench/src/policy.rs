@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use dmprl_analysis::export;
 use dmprl_run::{Interrupted, Watch};
+use dmprl_runtime::PolicyRuntime;
 use dmprl_shared::policy_file::OpenedPolicy;
-use dmprl_shared::runtime::PolicyRuntime;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 

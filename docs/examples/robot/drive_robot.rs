@@ -12,7 +12,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 use std::{env, thread};
 
-use dmprl_shared::runtime::PolicyRuntime;
+use dmprl_runtime::PolicyRuntime;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 /// Longest time between two control steps, in control steps.

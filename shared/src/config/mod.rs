@@ -4,18 +4,14 @@
 //! environment variables, `--set` and flags.
 //! `layers` merges them as TOML tables. It rejects unknown keys and suggests the nearest known one.
 //! `resolve` fills in values that depend on others and checks all of them. Every default of the
-//! system is in this folder.
+//! system is in this folder or, for policies, in `dmprl_runtime::config`.
 
 mod algorithm;
-mod algorithm_name;
-mod dmp;
 pub mod endpoint;
 mod experiment;
 mod layers;
-mod policy_check;
 mod presets;
 mod randomise;
-mod range;
 mod resolve;
 mod task;
 mod tasks;
@@ -24,11 +20,11 @@ pub use algorithm::{
     AlgorithmConfig, CriticInput, ExplorationConfig, ExplorationKind, LearningRateDecay, NdpConfig,
     SacConfig, Target, Td3Config, TqcConfig, WarmUpKind, Windows,
 };
-pub use algorithm_name::AlgorithmName;
-pub use dmp::{
-    BasisWidths, CanonicalIntegration, Controller, DmpConfig, ForcingScaling, Integrator,
-    PolicyConfig, PolicyKind, RhoKind, Start, StartSource, StartVelocity,
+pub use dmprl_runtime::config::{
+    AlgorithmName, BasisWidths, CanonicalIntegration, Controller, DmpConfig, ForcingScaling,
+    Integrator, PolicyConfig, PolicyKind, RangeError, RhoKind, Start, StartSource, StartVelocity,
 };
+use dmprl_runtime::config::{check_hidden, range};
 pub use experiment::{
     ActorsConfig, Backend, BridgeConfig, CheckpointConfig, DeliveryConfig, DeliveryLevel,
     DemonstrationsConfig, Device, EvaluationConfig, ExperimentConfig, Hindsight, LearnerConfig,
@@ -37,7 +33,6 @@ pub use experiment::{
 pub use layers::{ConfigError, Layers, nearest};
 pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults, suitable_preset};
 pub use randomise::RandomiseConfig;
-pub use range::{RangeError, range};
 pub use resolve::Limits;
 pub use task::{TaskConfig, is_python_object};
 pub use tasks::{TASKS, TaskDefaults, task_defaults};

@@ -3,10 +3,9 @@
 mod algorithms;
 
 use super::endpoint::{is_endpoint, is_plain};
-use super::policy_check::check_hidden;
 use super::{
     AlgorithmName, ConfigError, CriticInput, DeliveryLevel, ExperimentConfig, PolicyKind,
-    RangeError, Start, WarmUpKind, Windows, range,
+    RangeError, Start, WarmUpKind, Windows, check_hidden, range,
 };
 
 /// Properties of the machine, passed in by the caller.

@@ -2,7 +2,7 @@
 
     pip install -r requirements.txt && python make_golden.py
 
-Read by shared/src/dmp/golden_tests.rs, which reproduces the numbers with our own parts.
+Read by shared/runtime/src/dmp/golden_tests.rs, which reproduces the numbers with our own parts.
 
 Both packages use the paper's forcing term (no factor g - y0) and semi-implicit Euler steps. They
 differ from our defaults in the phase (exact; alpha_x 4.605 and 3) and in the basis widths.

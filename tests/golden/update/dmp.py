@@ -2,7 +2,7 @@
 
 Nothing here is the affine map that dmprl runs: every integration step is a tensor operation, and
 the gradient goes back through all of them. Equations: section 2 of Ijspeert et al. 2013, with the
-readings that shared/src/dmp/mod.rs lists (phase advanced before the basis is evaluated).
+readings that shared/runtime/src/dmp/mod.rs lists (phase advanced before the basis is evaluated).
 """
 
 import math

@@ -3,9 +3,9 @@
 use std::fs;
 use std::path::Path;
 
+use dmprl_runtime::PolicyRuntime;
 use dmprl_shared::policy::Hold;
 use dmprl_shared::policy_file;
-use dmprl_shared::runtime::PolicyRuntime;
 use dmprl_tests::program::Workplace;
 use serde_json::json;
 

@@ -1,5 +1,5 @@
-//! Generates `docs/configuration-keys.md` from the types in `shared/src/config/`: each key with its
-//! doc comment and its default.
+//! Generates `docs/configuration-keys.md` from the types in `shared/src/config/` and
+//! `shared/runtime/src/config/`: each key with its doc comment and its default.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -26,7 +26,7 @@ const WRITE: &str = "WRITE_CONFIGURATION_KEYS";
 const HEAD: &str = "\
 # Every configuration key
 
-<!-- Made from the types in shared/src/config by the test `tidy`. To generate it again:
+<!-- Made from the types of the configuration by the test `tidy`. To generate it again:
      WRITE_CONFIGURATION_KEYS=1 cargo test --release --test tidy -->
 
 Set a key in a file for `--config`, with `--set KEY=VALUE`, or in an environment variable;
@@ -47,7 +47,7 @@ fn the_page_of_configuration_keys_matches_the_types() {
     let same = written.lines().zip(made.lines()).take_while(|(a, b)| a == b).count();
     assert!(
         written == made,
-        "{PAGE} differs from the types in shared/src/config at line {}:\n  found    {:?}\n  \
+        "{PAGE} differs from the types of the configuration at line {}:\n  found    {:?}\n  \
          expected {:?}\ngenerate it again: {WRITE}=1 cargo test --release --test tidy",
         same + 1,
         written.lines().nth(same),
@@ -73,7 +73,7 @@ fn page() -> String {
         }
         let property = &resolved(&schema, &of_section)["properties"][name];
         let about = meaning(property);
-        assert!(!about.is_empty(), "{key} has no comment in shared/src/config");
+        assert!(!about.is_empty(), "{key} has no comment");
         let value = default_text(&key, &defaults, &others);
         let kind = kind(&schema, property);
         // A list is a block of its own; a sentence follows on the same line.

@@ -22,7 +22,7 @@ const STAGES: u32 = 8;
 const FOREIGN_FOLDERS: [&str; 5] = ["target", "runs", "__pycache__", ".git", ".venv"];
 /// Start of the names of environments that were replaced.
 const OLD_ENVIRONMENT: &str = ".venv.old-";
-const MEMBERS: [&str; 17] = [
+const MEMBERS: [&str; 18] = [
     "actors",
     "deploy/analysis",
     "deploy/bench",
@@ -37,6 +37,7 @@ const MEMBERS: [&str; 17] = [
     "deploy/sweep",
     "learner",
     "shared",
+    "shared/runtime",
     "tests",
     "tests/book",
     "tests/manifests",

@@ -10,7 +10,7 @@ const CIRCLE_MAX: usize = 3;
 
 /// The crates of the program and the other crates of the workspace that each uses, from the
 /// highest to the lowest. A crate may only use those below it.
-const CRATES: [(&str, &[&str]); 14] = [
+const CRATES: [(&str, &[&str]); 15] = [
     ("deploy/extension", &["actors"]),
     (
         "deploy/cli",
@@ -31,7 +31,17 @@ const CRATES: [(&str, &[&str]); 14] = [
     ),
     (
         "deploy/bench",
-        &["actors", "analysis", "bridge", "control", "learner", "run", "shared", "supervisor"],
+        &[
+            "actors",
+            "analysis",
+            "bridge",
+            "control",
+            "learner",
+            "run",
+            "runtime",
+            "shared",
+            "supervisor",
+        ],
     ),
     ("deploy/chaos", &["learner", "run", "shared", "supervisor"]),
     ("deploy/sweep", &["analysis", "run", "shared", "supervisor"]),
@@ -43,7 +53,8 @@ const CRATES: [(&str, &[&str]); 14] = [
     ("deploy/run", &["shared"]),
     ("actors", &["shared"]),
     ("learner", &["shared"]),
-    ("shared", &[]),
+    ("shared", &["runtime"]),
+    ("shared/runtime", &[]),
 ];
 
 #[test]

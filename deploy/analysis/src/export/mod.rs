@@ -1,7 +1,7 @@
 //! Exports a run's policy as a single file, for use on a robot.
 //!
 //! `onnx` encodes the complete policy as a graph for any ONNX runtime. `safetensors` encodes it in
-//! the project's own format (`dmprl_shared::policy_file`), for Rust and for `dmprl.Policy`.
+//! the project's own format (`dmprl_runtime::policy_file`), for Rust and for `dmprl.Policy`.
 
 mod graph;
 mod onnx;

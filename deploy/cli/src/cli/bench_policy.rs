@@ -21,7 +21,7 @@ use super::{cores, emit, open_run, prepare_python, python_home, python_of};
 const HELP: &str = "\
 One observation at a time, on one core, as on a robot. In every round each of these makes --calls
 calls; all calls of all rounds count.
-  decision   from an observation to the actions of a segment, with dmprl_shared::runtime
+  decision   from an observation to the actions of a segment, with dmprl-runtime
   action     one control step of the same; one in K control steps makes a decision
   numpy      the decision by dmprl.Policy, from the file that `dmprl export` writes
   onnx       the decision by onnxruntime, if the interpreter has it

@@ -13,9 +13,9 @@ use super::{emit, open_run};
 
 const HELP: &str = "\
 The file contains everything needed to act: observation normalisation, network, movement primitive,
-controller, start, action bounds, and its origin. safetensors is read by the crate dmprl-shared
-(dmprl_shared::runtime), without Python, and in Python by dmprl.Policy, which needs only NumPy. onnx
-is for any ONNX runtime: input `observation` (batch, O), output `actions` (batch, K, A).
+controller, start, action bounds, and its origin. safetensors is read by the crate dmprl-runtime,
+without Python, and in Python by dmprl.Policy, which needs only NumPy. onnx is for any ONNX runtime:
+input `observation` (batch, O), output `actions` (batch, K, A).
 
 For a robot, state with --hold the command that holds it, as in docs/robot.md. Without it, the file
 acts in simulations; on a robot, the program that drives it must state the hold.

@@ -1,8 +1,8 @@
 //! Tests of policy files: round trips, damage, and files of other policies.
 
 use super::*;
-use crate::config::{ExperimentConfig, Layers};
 use crate::spec::EnvSpec;
+use crate::test_support::description;
 
 fn spec() -> EnvSpec {
     EnvSpec {
@@ -19,19 +19,14 @@ fn spec() -> EnvSpec {
 }
 
 fn policy(keys: &[(&str, &str)]) -> Policy {
-    let mut layers = Layers::new();
-    for (key, value) in keys {
-        layers.set("test", key, value).unwrap();
-    }
-    let config: ExperimentConfig = layers.finish().unwrap();
-    Policy::new(config.policy_description(&spec())).unwrap()
+    Policy::new(description(spec(), keys)).unwrap()
 }
 
 #[test]
 fn stochastic_policy_keeps_its_standard_deviations() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("1.safetensors");
-    let own = policy(&[("algorithm.name", "ndp")]);
+    let own = policy(&[("algorithm", "ndp")]);
     let mut values = own.initial_parameters(&mut crate::seeds::stream(1, "test", 0));
     values[own.shape().parameters_len()..].fill(-0.5);
     let snapshot = ParameterSnapshot {
@@ -108,16 +103,16 @@ fn saved(keys: &[(&str, &str)], path: &Path) -> (Policy, ParameterSnapshot, Orig
 fn policy_is_restored_from_the_file_alone() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("mine.safetensors");
-    let sources = "[{ cos = 0, sin = 1, velocity = 2 }, { index = 3, velocity = 2, scale = -1.0 }]";
+    let sources = r#"[{ "cos": 0, "sin": 1, "velocity": 2 }, { "index": 3, "velocity": 2 }]"#;
     for keys in [
         &[][..],
-        &[("policy.kind", "mlp"), ("algorithm.name", "sac")],
+        &[("policy.kind", "mlp"), ("algorithm", "sac")],
         &[("policy.kind", "chunk")],
-        &[("algorithm.name", "ndp"), ("policy.controller", "position")],
+        &[("algorithm", "ndp"), ("policy.controller", "position")],
         &[("policy.start", "carry"), ("dmp.alpha_y", "12.5"), ("policy.rho", "free")],
-        &[("policy.start", "observed"), ("task.start_sources", sources)],
+        &[("policy.start", "observed"), ("start_sources", sources)],
         &[("policy.start", "action"), ("policy.controller", "direct")],
-        &[("task.kwargs.reward_type", "dense"), ("task.wrappers", "[\"module:name\"]")],
+        &[("task_options", "{} [\"module:name\"]")],
     ] {
         let (own, snapshot, origin) = saved(keys, &path);
         let opened = open(&path).unwrap();

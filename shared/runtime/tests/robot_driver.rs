@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
-#[path = "../../docs/examples/robot/drive_robot.rs"]
+#[path = "../../../docs/examples/robot/drive_robot.rs"]
 #[expect(dead_code, reason = "the test starts `drive` instead of `main`")]
 mod drive_robot;
 
@@ -11,12 +11,11 @@ use std::io::{BufRead, BufReader, Lines, Write};
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
-use dmprl_shared::config::Layers;
-use dmprl_shared::parameters::ParameterSnapshot;
-use dmprl_shared::policy::{Hold, Policy};
-use dmprl_shared::runtime::PolicyRuntime;
-use dmprl_shared::spec::EnvSpec;
-use dmprl_shared::{policy_file, seeds};
+use dmprl_runtime::config::{AlgorithmName, DmpConfig, PolicyConfig};
+use dmprl_runtime::parameters::ParameterSnapshot;
+use dmprl_runtime::policy::{Hold, Policy, PolicyDescription};
+use dmprl_runtime::spec::EnvSpec;
+use dmprl_runtime::{PolicyRuntime, policy_file, seeds};
 use rustix::process::{Pid, Signal, kill_process};
 
 const ENTRY: &str = "another_process_drives";
@@ -134,7 +133,15 @@ fn policy(hold: Option<&Hold>) -> Vec<u8> {
         observation_names: Vec::new(),
         goal_rule: None,
     };
-    let policy = Policy::new(Layers::new().finish().unwrap().policy_description(&spec)).unwrap();
+    let description = PolicyDescription {
+        spec,
+        algorithm: AlgorithmName::Td3,
+        policy: PolicyConfig::default(),
+        dmp: DmpConfig::default(),
+        start_sources: Vec::new(),
+        task_options: None,
+    };
+    let policy = Policy::new(description).unwrap();
     let mut values = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
     values.iter_mut().for_each(|value| *value *= 5.0);
     let architecture_hash = policy.architecture_hash();

@@ -3,19 +3,15 @@
 use rand::RngExt;
 
 use super::*;
-use crate::config::Layers;
 use crate::seeds;
 use crate::spec::EnvSpec;
+use crate::test_support::description;
 
 const ROWS: usize = 3;
 
 fn head(keys: &[(&str, &str)]) -> DmpHead {
-    let mut layers = Layers::new();
-    let sources = "[{cos=0, sin=1, velocity=2}, {index=3, velocity=2, scale=-1.0}]";
-    layers.set("test", "task.start_sources", sources).unwrap();
-    for (key, value) in keys {
-        layers.set("test", key, value).unwrap();
-    }
+    let sources = r#"[{ "cos": 0, "sin": 1, "velocity": 2 },
+                      { "index": 3, "velocity": 2, "scale": -1.0 }]"#;
     let spec = EnvSpec {
         id: "Test-v0".into(),
         observation_len: 4,
@@ -27,7 +23,8 @@ fn head(keys: &[(&str, &str)]) -> DmpHead {
         observation_names: Vec::new(),
         goal_rule: None,
     };
-    DmpHead::new(&layers.finish().unwrap().policy_description(&spec)).unwrap()
+    let keys = [&[("start_sources", sources)], keys].concat();
+    DmpHead::new(&description(spec, &keys)).unwrap()
 }
 
 #[test]

@@ -3,14 +3,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a test's helpers fail the test")]
 
+#[path = "../../tests/counting_allocator/mod.rs"]
 mod counting_allocator;
 
 use counting_allocator::allocations_of;
-use dmprl_shared::config::Layers;
-use dmprl_shared::policy::{Hold, Policy};
-use dmprl_shared::runtime::PolicyRuntime;
-use dmprl_shared::seeds;
-use dmprl_shared::spec::EnvSpec;
+use dmprl_runtime::config::{AlgorithmName, DmpConfig, PolicyConfig, PolicyKind, Start};
+use dmprl_runtime::policy::{Hold, Policy, PolicyDescription};
+use dmprl_runtime::spec::EnvSpec;
+use dmprl_runtime::{PolicyRuntime, seeds};
 
 /// The only test in its binary, because the counter counts all threads.
 #[test]
@@ -26,11 +26,21 @@ fn decisions_steps_and_holds_allocate_nothing() {
         observation_names: Vec::new(),
         goal_rule: None,
     };
-    let kinds = [&[][..], &[("policy.kind", "mlp")], &[("policy.start", "carry")]];
-    for keys in kinds.into_iter().chain([&[("policy.start", "action")][..]]) {
-        let mut layers = Layers::new();
-        keys.iter().for_each(|(key, value)| layers.set("test", key, value).unwrap());
-        let policy = Policy::new(layers.finish().unwrap().policy_description(&spec)).unwrap();
+    for config in [
+        PolicyConfig::default(),
+        PolicyConfig { kind: PolicyKind::Mlp, ..PolicyConfig::default() },
+        PolicyConfig { start: Start::Carry, ..PolicyConfig::default() },
+        PolicyConfig { start: Start::Action, ..PolicyConfig::default() },
+    ] {
+        let description = PolicyDescription {
+            spec: spec.clone(),
+            algorithm: AlgorithmName::Td3,
+            policy: config.clone(),
+            dmp: DmpConfig::default(),
+            start_sources: Vec::new(),
+            task_options: None,
+        };
+        let policy = Policy::new(description).unwrap();
         let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         let mut runtime = PolicyRuntime::new(policy, &parameters);
         let observation = [0.1, -0.2, 0.3, -0.4];
@@ -46,6 +56,6 @@ fn decisions_steps_and_holds_allocate_nothing() {
                 runtime.reset(None).unwrap();
             }
         });
-        assert_eq!(allocated, 0, "{keys:?}");
+        assert_eq!(allocated, 0, "{config:?}");
     }
 }

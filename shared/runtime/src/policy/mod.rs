@@ -42,7 +42,7 @@ pub use tanh::tanh;
 
 use crate::config::{Controller, PolicyKind, RangeError};
 use crate::dmp::DmpError;
-use crate::segment::{ActionBounds, SegmentLayout};
+use crate::segment_layout::{ActionBounds, SegmentLayout};
 use crate::spec::SpecError;
 
 /// Why a policy cannot be built.

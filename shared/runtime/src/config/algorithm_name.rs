@@ -1,10 +1,12 @@
 //! The learning algorithms, of which some have policies of their own kind.
 
+#[cfg(feature = "schema")]
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Algorithm that updates the networks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum AlgorithmName {
     /// Deep deterministic policy gradient (Lillicrap et al. 2016); called DDPG-DMP with segments.

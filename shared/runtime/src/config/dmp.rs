@@ -1,10 +1,12 @@
 //! Configuration of the policy: its kind, its DMP and its inverse controller.
 
+#[cfg(feature = "schema")]
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// How the phase x of the canonical system advances.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum CanonicalIntegration {
     /// Explicit Euler; x is advanced before the basis is evaluated, so that with the default values
@@ -15,7 +17,8 @@ pub enum CanonicalIntegration {
 }
 
 /// Widths h_i of the Gaussian basis functions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum BasisWidths {
     /// h_i = N^1.5 / (c_i alpha_x), as in Neural Dynamic Policies.
@@ -26,7 +29,8 @@ pub enum BasisWidths {
 }
 
 /// Factor on the forcing term.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum ForcingScaling {
     /// No factor (the paper's equation 9).
@@ -36,7 +40,8 @@ pub enum ForcingScaling {
 }
 
 /// How the transformation system is integrated over a segment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Integrator {
     /// yd first, then y with the new yd.
@@ -74,7 +79,8 @@ impl Integrator {
 }
 
 /// The dynamic movement primitive, one per action dimension.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct DmpConfig {
     /// Number of basis functions N. More basis functions allow more detailed motions.
@@ -113,7 +119,8 @@ impl Default for DmpConfig {
 }
 
 /// Kind of policy.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum PolicyKind {
     /// A network that outputs DMP and inverse-controller parameters for a segment.
@@ -138,7 +145,8 @@ impl PolicyKind {
 }
 
 /// Bounds of the inverse controller's parameters rho.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum RhoKind {
     /// rho = (1, 0, 0, 0) + rho_range * tanh(.).
@@ -148,7 +156,8 @@ pub enum RhoKind {
 }
 
 /// Controller that converts the DMP's motion into actions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Controller {
     /// The adaptive inverse controller, with rho from the network.
@@ -162,7 +171,8 @@ pub enum Controller {
 }
 
 /// Initial state of a segment's DMP.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
     /// y = yd = 0 at the start of every segment.
@@ -177,7 +187,8 @@ pub enum Start {
 }
 
 /// Source of yd0 for `start = "observed"`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum StartVelocity {
     /// The measured velocity, converted to DMP time.
@@ -187,7 +198,8 @@ pub enum StartVelocity {
 }
 
 /// Entries of an observation from which one action dimension's y0 and yd0 are read.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(untagged, deny_unknown_fields)]
 pub enum StartSource {
     /// y0 = atan2(observation\[sin\], observation\[cos\]).
@@ -216,7 +228,8 @@ fn unit_scale() -> f32 {
 }
 
 /// The policy, which maps an observation to the actions of a segment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct PolicyConfig {
     /// Kind of policy.

@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::*;
-use crate::config::{ExperimentConfig, Layers};
 use crate::policy::Hold;
 use crate::seeds;
+use crate::test_support::description;
 
 const DIMS: usize = 2;
 const STEPS: usize = 5;
@@ -26,13 +26,8 @@ fn spec() -> EnvSpec {
 }
 
 fn policy(keys: &[(&str, &str)]) -> Policy {
-    let mut layers = Layers::new();
-    layers.set("test", "policy.hidden", "[32]").unwrap();
-    for (key, value) in keys {
-        layers.set("test", key, value).unwrap();
-    }
-    let config: ExperimentConfig = layers.finish().unwrap();
-    Policy::new(config.policy_description(&spec())).unwrap()
+    let keys = [&[("policy.hidden", "[32]")], keys].concat();
+    Policy::new(description(spec(), &keys)).unwrap()
 }
 
 /// Creates a runtime with scaled-up parameters, so that actions differ from step to step.
@@ -56,7 +51,7 @@ fn observation(seed: f64) -> [f64; 4] {
 
 #[test]
 fn segment_equals_the_policys_decision_in_the_environments_units() {
-    for keys in [&[][..], &[("policy.kind", "mlp")], CARRY, ACTION, &[("algorithm.name", "sac")]] {
+    for keys in [&[][..], &[("policy.kind", "mlp")], CARRY, ACTION, &[("algorithm", "sac")]] {
         let mut runtime = runtime(keys);
         let own = policy(keys);
         let mut parameters = own.initial_parameters(&mut seeds::stream(1, "test", 0));

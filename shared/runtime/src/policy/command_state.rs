@@ -33,18 +33,17 @@ impl CommandState {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Layers;
     use crate::policy::Policy;
     use crate::seeds;
     use crate::spec::EnvSpec;
+    use crate::test_support::description;
 
     /// Runs three segments of a random policy from the start of an episode. Returns the largest
     /// jumps of the action and of its rate of change, per DMP time, at their borders. At the start
     /// of the episode the robot is at rest at u = 0.
     fn jumps(segment_steps: usize) -> [f32; 2] {
         let steps = segment_steps.to_string();
-        let mut layers = Layers::new();
-        for (key, value) in [
+        let keys = [
             ("policy.start", "action"),
             ("policy.controller", "direct"),
             ("policy.hidden", "[16]"),
@@ -52,9 +51,7 @@ mod tests {
             ("dmp.integration_steps", &steps),
             // With `exact` the phase does not depend on the number of steps.
             ("dmp.canonical", "exact"),
-        ] {
-            layers.set("test", key, value).unwrap();
-        }
+        ];
         let spec = EnvSpec {
             id: "Test-v0".into(),
             observation_len: 1,
@@ -66,7 +63,7 @@ mod tests {
             observation_names: Vec::new(),
             goal_rule: None,
         };
-        let policy = Policy::new(layers.finish().unwrap().policy_description(&spec)).unwrap();
+        let policy = Policy::new(description(spec, &keys)).unwrap();
         let mut parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         parameters.iter_mut().for_each(|parameter| *parameter *= 3.0);
         let mut work = policy.workspace(1);

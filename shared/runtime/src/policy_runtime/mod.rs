@@ -1,14 +1,4 @@
-//! Runs a trained policy on a robot, from a policy file and without Python.
-//!
-//! [`PolicyRuntime`] returns the actions of a segment, or one action per control step. It rejects
-//! invalid observations, limits actions to their bounds and their rate to a maximum, and holds the
-//! robot when observations stop, when its caller was frozen, and at the end.
-//!
-//! ```no_run
-#![doc = include_str!("../../../docs/examples/robot/drive_robot.rs")]
-//! ```
-//! `dmprl.Policy` is the same runtime in NumPy (`envs_py/dmprl/policy.py`). A test compares both
-//! and the ONNX graph.
+//! The policy, its limits and its hold, one control step after the other.
 
 mod deadline;
 mod error;

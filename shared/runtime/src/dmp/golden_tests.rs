@@ -8,7 +8,7 @@ use super::*;
 use crate::config::{BasisWidths, CanonicalIntegration, Integrator};
 use serde_json::Value;
 
-const GOLDEN: &str = include_str!("../../../tests/golden/dmp/golden.json");
+const GOLDEN: &str = include_str!("../../../../tests/golden/dmp/golden.json");
 
 struct Case(Value);
 
