@@ -73,6 +73,45 @@ fn each_crate_uses_only_crates_below_it() {
     }
 }
 
+/// The lock file also lists optional dependencies that another member of the workspace turns on, so
+/// a program next to a robot gets these packages or fewer.
+#[test]
+fn a_program_next_to_a_robot_gets_nothing_that_only_a_training_needs() {
+    let read = |path: &str| -> toml::Table {
+        fs::read_to_string(project_root().join(path)).unwrap().parse().unwrap()
+    };
+    let manifest = read("shared/runtime/Cargo.toml");
+    assert!(!manifest["features"].as_table().unwrap().contains_key("default"));
+    let is_optional = |dependency: &toml::Value| {
+        dependency.get("optional").and_then(toml::Value::as_bool).unwrap_or(false)
+    };
+    let lock = read("Cargo.lock");
+    let mut found = BTreeSet::new();
+    let dependencies = manifest["dependencies"].as_table().unwrap().iter();
+    let mut open: Vec<&str> = dependencies
+        .filter(|(_, dependency)| !is_optional(dependency))
+        .map(|(name, _)| name.as_str())
+        .collect();
+    while let Some(name) = open.pop() {
+        if !found.insert(name) {
+            continue;
+        }
+        for package in lock["package"].as_array().unwrap() {
+            if package["name"].as_str() == Some(name)
+                && let Some(dependencies) = package.get("dependencies")
+            {
+                let names = dependencies.as_array().unwrap().iter();
+                // A version follows the name if there are several.
+                open.extend(names.filter_map(|name| name.as_str()?.split(' ').next()));
+            }
+        }
+    }
+    assert!(found.contains("gemm-common"), "{found:?}");
+    for name in ["iceoryx2", "schemars", "tokio", "toml", "zenoh"] {
+        assert!(!found.contains(name), "dmprl-runtime depends on {name}");
+    }
+}
+
 #[test]
 fn modules_do_not_use_each_other_in_circles() {
     let mut circles = Vec::new();
