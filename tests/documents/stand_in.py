@@ -136,13 +136,7 @@ def join(run):
     training = subprocess.Popen(trained, stderr=subprocess.DEVNULL)
     try:
         until(lambda: Path(run, "processes.json").is_file(), "a run to join")
-        joined = subprocess.Popen(
-            [PROGRAM, "actor", "--join", run], stderr=subprocess.PIPE, encoding="utf-8"
-        )
-        # If it may not join, this is its last line.
-        said = joined.stderr.readline()
-        while said and not re.match(r"joined .+ as actor-\d+", said):
-            said = joined.stderr.readline()
+        joined, said = joined_worker(run)
         joined.send_signal(signal.SIGINT)
         joined.communicate(timeout=WAIT_S)
         # Ctrl-C makes it deliver its segments and end.
@@ -150,6 +144,24 @@ def join(run):
     finally:
         training.send_signal(signal.SIGINT)
         training.wait(WAIT_S)
+
+
+def joined_worker(run):
+    """Starts a worker until the run accepts it; returns it and its line, empty if it may not join.
+
+    A run refuses workers for a moment after it has written `processes.json`.
+    """
+    deadline = time.monotonic() + WAIT_S
+    while True:
+        words = [PROGRAM, "actor", "--join", run]
+        joined = subprocess.Popen(words, stderr=subprocess.PIPE, encoding="utf-8")
+        said = joined.stderr.readline()
+        while said and not re.match(r"joined .+ as actor-\d+", said):
+            said = joined.stderr.readline()
+        if said or time.monotonic() > deadline:
+            return joined, said
+        joined.wait(WAIT_S)
+        time.sleep(POLL_S)
 
 
 def until(condition, what):
