@@ -13,6 +13,7 @@ mod lock;
 mod log_tail;
 mod manifest;
 mod policies;
+mod policy_copy;
 mod processes;
 mod progress;
 pub mod project;

@@ -14,7 +14,7 @@ fn a_policy_of_the_package_is_evaluated_and_exported_like_one_of_a_run() {
     assert_eq!(evaluated["run"], std::fs::canonicalize(&copied).unwrap().display().to_string());
     place.run(&["export", "zoo:panda-reach"]).with_status(0);
     assert!(Path::new(&copied).join("panda-reach.safetensors").is_file());
-    let refused = "panda-reach is a copy of a policy that comes with dmprl and has no checkpoint";
+    let refused = "zoo-panda-reach is a copy of zoo:panda-reach and has no checkpoint";
     place.run(&["resume", &copied]).with_status(2).saying(refused);
     place.run(&["eval", "zoo:panda-reach", "--episodes", "1"]).with_status(0);
     let run = place.path("run");

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use clap::Args;
 use dmprl_learner::checkpoint;
+use dmprl_run::RunDirectory;
 use dmprl_run::failure::{Outcome, wrong_use};
-use dmprl_run::{RunDirectory, Zoo};
 use dmprl_shared::config::Limits;
 use dmprl_supervisor::capacity;
 use dmprl_supervisor::{self as launch, Trial};
@@ -43,11 +43,11 @@ pub(super) struct ResumeArgs {
 
 pub(super) fn run(args: &ResumeArgs) -> anyhow::Result<Outcome> {
     let run = RunDirectory::open(&args.run)?;
-    if Zoo::is_copy(&run) {
+    if let Some(origin) = run.copied_from() {
+        let path = run.path().display();
         return Err(wrong_use(format!(
-            "{} is a copy of a policy that comes with dmprl and has no checkpoint; start a new run \
-             from it: dmprl train TASK --init-from zoo:TASK",
-            run.path().display()
+            "{path} is a copy of {origin} and has no checkpoint; start a new run from it: dmprl \
+             train TASK --init-from {path}"
         )));
     }
     let written = run.config()?;

@@ -1,9 +1,12 @@
 //! Tests of the copies of policies that come with the package.
 
+use std::fs;
+
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::supervision::EvaluationRow;
 
 use super::*;
+use crate::directory::FOLDERS;
 use crate::failure::WrongUse;
 use crate::manifest::Manifest;
 
@@ -60,7 +63,7 @@ fn the_copy_is_marked_and_links_its_best_policy() {
     let (_package, zoo) = package();
     let runs = tempfile::tempdir().unwrap();
     let run = zoo.open("lift", runs.path()).unwrap();
-    assert!(Zoo::is_copy(&run));
+    assert_eq!(run.copied_from().as_deref(), Some("zoo:lift"));
     let best = fs::read_to_string(run.checkpoints_path().join("best")).unwrap();
     assert_eq!(best, "parameters");
 }
@@ -71,7 +74,7 @@ fn a_command_that_copies_at_the_same_time_leaves_nothing_behind() {
     let runs = tempfile::tempdir().unwrap();
     let run = zoo.open("lift", runs.path()).unwrap();
     let original = RunDirectory::open(&zoo.folder.join("lift")).unwrap();
-    copy(&original, "lift", runs.path(), run.path()).unwrap();
+    original.copy_policy("zoo:lift", run.path()).unwrap();
     assert_eq!(runs.path().read_dir().unwrap().count(), 1);
 }
 
