@@ -75,7 +75,7 @@ class LockTest(unittest.TestCase):
 
     def test_parts_that_the_program_installs_are_locked_and_go_with_the_base(self):
         extras = self.manifest["project"]["optional-dependencies"]
-        for extra in ["demos", "search", "video"]:
+        for extra in ["demos", "hub", "search", "video"]:
             self.check(extra, extras[extra])
             for where in self.places():
                 base = versions("base", where)

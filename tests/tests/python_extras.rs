@@ -1,5 +1,6 @@
 //! The Python package with its optional extras: readers of demonstrations, panda-gym,
-//! Gymnasium-Robotics, Optuna, an ONNX runtime, TensorBoard's reader, experiment trackers and mypy.
+//! Gymnasium-Robotics, huggingface_hub, Optuna, an ONNX runtime, TensorBoard's reader, experiment
+//! trackers and mypy.
 //!
 //! They have their own virtual environment, made once: PyBullet is large, most users need none of
 //! them, and it has no build for some versions of Python. Tests of packages that cannot be
@@ -22,7 +23,7 @@ use dmprl_tests::{exported, project_root};
 /// Extras of `envs_py/pyproject.toml`, from all to one, with the tests that need them.
 const ATTEMPTS: [(&str, &str); 2] = [
     ("test", "test_*.py"),
-    ("demos,frames,onnx,robotics,search,tensorboard,trackers,types", "test_[dforst]*.py"),
+    ("demos,frames,hub,onnx,robotics,search,tensorboard,trackers,types", "test_[dfhorst]*.py"),
 ];
 /// PyBullet has builds only for this version.
 const REMEDY: &str = "PYO3_PYTHON=python3.11 on x86-64, with a network";
