@@ -31,7 +31,7 @@ from dmprl.hold import Hold, NoHoldError
 from dmprl.policy import Policy
 from dmprl.policy_file import PolicyFileError
 from dmprl.program import ProgramError
-from dmprl.run import Run
+from dmprl.run import Run, pull
 from dmprl.training import TrainingError, train
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ __all__ = [
     "Run",
     "TrainingError",
     "make",
+    "pull",
     "train",
 ]
 __version__ = "0.1.0"

@@ -98,11 +98,35 @@ class Run:
         arguments = [str(self.path), "--json", *program.flags(flags)]
         return Path(json.loads(program.call("record", *arguments, quiet=quiet))["mp4"])
 
+    def push(self, repo: str, *, quiet: bool = True, **flags: Any) -> str:
+        """Uploads a policy to the Hugging Face hub, and returns the address of its repository.
+
+        :param repo: ``OWNER/NAME``; it is created if it does not exist.
+        :param quiet: suppresses progress.
+        :param flags: flags of ``dmprl push``: ``private=True``, ``policy="latest"``, ``film=...`` a
+            file, ``message=...``.
+        :raises dmprl.ProgramError: if it cannot be uploaded; the message gives the reason.
+        """
+        arguments = [str(self.path), repo, "--json", *program.flags(flags)]
+        return json.loads(program.call("push", *arguments, quiet=quiet))["url"]
+
     def _lines(self, name: str) -> list[dict[str, Any]]:
         """Reads the complete lines of a file; training may still be writing the last one."""
         file = self.path / name
         text = file.read_text() if file.is_file() else ""
         return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+def pull(repo: str, *, quiet: bool = True, **flags: Any) -> Run:
+    """Downloads a policy from the Hugging Face hub, and returns its run directory.
+
+    :param repo: ``OWNER/NAME``, which ``dmprl push`` uploaded.
+    :param quiet: suppresses progress.
+    :param flags: flags of ``dmprl pull``: ``revision=...``, ``output=...`` another run directory.
+    :raises dmprl.ProgramError: if it cannot be downloaded; the message gives the reason.
+    """
+    arguments = [repo, "--json", *program.flags(flags)]
+    return Run(json.loads(program.call("pull", *arguments, quiet=quiet))["path"])
 
 
 def _frame(rows: list[dict[str, Any]], library: str) -> Any:

@@ -4,7 +4,8 @@
     stand_in.py dmprl eval runs/mine
 
 It runs the program itself, but a fiftieth of the steps, few rounds of a benchmark, a sweep without
-its runs, and a page only until it can be opened. Everything else is done as it is written.
+its runs, a page only until it can be opened, and a stand-in for the Hugging Face hub. Everything
+else is done as it is written.
 """
 
 import os
@@ -25,6 +26,7 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 SERVERS = ("dashboard", "play")
 PICTURES = ("play", "record")
+OF_A_HUB = ("push", "pull")
 FEW = {
     "chaos": {"--seconds": "1", "--worker-kills": "1", "--learner-kills": "1"},
     "eval": {"--episodes": "2"},
@@ -66,6 +68,10 @@ def main(words):
         if command == "play" and "--stream" not in words:
             words = [*words, "--stream"]
         return serve([*words, "--port", "0"])
+    if command in OF_A_HUB:
+        hub = [sys.executable, str(PROJECT / "envs_py/tests_extras/hub_stand_in.py")]
+        words = [*hub, "--root", "hub", "--around", PROGRAM, *words]
+        return subprocess.run(words, check=False).returncode
     if words[:2] == ["actor", "--join"]:
         return join(words[2])
     return subprocess.run([PROGRAM, *cheap(words)], check=False).returncode

@@ -7,5 +7,6 @@
 pub mod export;
 pub mod motion;
 pub mod plots;
+pub mod publication;
 pub mod report;
 pub mod tensorboard;

@@ -203,6 +203,8 @@ fn every_flag_that_is_shown_exists() {
         "demos convert",
         "record",
         "export",
+        "push",
+        "pull",
         "play",
         "bench rollout",
         "bench learner",
@@ -253,8 +255,8 @@ fn every_flag_that_is_shown_exists() {
 
 #[test]
 fn every_configuration_key_that_is_named_exists() {
-    const FILE_ENDINGS: [&str; 10] =
-        ["npz", "jsonl", "json", "json5", "toml", "token", "safetensors", "svg", "rs", "md"];
+    const FILE_ENDINGS: [&str; 11] =
+        ["npz", "jsonl", "json", "json5", "toml", "token", "safetensors", "svg", "rs", "md", "mp4"];
     let keys: BTreeSet<_> = Layers::new().keys().into_iter().collect();
     let sections: BTreeSet<_> = keys.iter().filter_map(|key| key.split('.').next()).collect();
     let mut seen = 0;

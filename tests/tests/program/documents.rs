@@ -73,6 +73,7 @@ pages! {
     every_block_about_results_runs: "docs/results.md",
     every_block_about_benchmarks_runs: "docs/benchmarks.md",
     every_block_about_trained_policies_runs: "docs/zoo.md",
+    every_block_about_sharing_runs: "docs/sharing.md",
     every_block_about_an_algorithm_of_ones_own_runs: "docs/own-algorithm.md",
 }
 

@@ -34,6 +34,7 @@ mod faults;
 #[cfg(feature = "hosts")]
 mod hosts;
 mod http;
+mod hub;
 mod interrupts;
 mod isolation;
 mod joining;

@@ -183,7 +183,8 @@ pub(super) fn paths(flag: &str, paths: &[PathBuf]) -> anyhow::Result<Option<Valu
     Ok((!texts.is_empty()).then_some(Value::Array(texts)))
 }
 
-fn absolute_folder(path: &str) -> anyhow::Result<String> {
+/// Resolves the path of an existing folder.
+pub(super) fn absolute_folder(path: &str) -> anyhow::Result<String> {
     let absolute = std::fs::canonicalize(path)
         .map_err(|error| wrong_use(format!("python path {path}: {error}")))?;
     if !absolute.is_dir() {

@@ -8,6 +8,7 @@ use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::{binary_bytes, shown};
 use dmprl_run::{PolicyChoice, replace_file};
 use dmprl_shared::policy::Hold;
+use dmprl_shared::policy_file::OpenedPolicy;
 
 use super::{emit, open_run};
 
@@ -72,7 +73,7 @@ impl Format {
 }
 
 /// Rejects an existing output that is not a regular file: root could replace even a device.
-fn check_output(path: &Path) -> anyhow::Result<()> {
+pub(super) fn check_output(path: &Path) -> anyhow::Result<()> {
     let refused = |what: &str| Err(wrong_use(format!("--output {}: {what}", path.display())));
     if path.exists() && !path.is_file() {
         return refused("expected a file or a new name, got something that is not a regular file");
@@ -81,6 +82,15 @@ fn check_output(path: &Path) -> anyhow::Result<()> {
         Some(folder) if !folder.is_dir() => refused("the folder does not exist; create it first"),
         _ => Ok(()),
     }
+}
+
+/// Adds the hold of `--hold` to a policy.
+pub(super) fn state_hold(opened: &mut OpenedPolicy, hold: Option<&Hold>) -> anyhow::Result<()> {
+    let Some(hold) = hold else { return Ok(()) };
+    hold.action(&opened.policy.description().spec)
+        .map_err(|error| wrong_use(format!("--hold {hold}: {error}")))?;
+    opened.hold = Some(hold.clone());
+    Ok(())
 }
 
 pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
@@ -98,11 +108,7 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
     let run = open_run(&args.run)?;
     let chosen = run.choose_policy(args.policy)?;
     let mut opened = read_policy(&run, &chosen)?;
-    if let Some(hold) = &args.hold {
-        hold.action(&opened.policy.description().spec)
-            .map_err(|error| wrong_use(format!("--hold {hold}: {error}")))?;
-        opened.hold = Some(hold.clone());
-    }
+    state_hold(&mut opened, args.hold.as_ref())?;
     let task = run.config()?.task.name;
     let path = args.output.clone().unwrap_or_else(|| {
         let name = dmprl_run::safe_name(&task);

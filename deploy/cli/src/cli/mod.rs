@@ -1,5 +1,6 @@
 //! The command line: its commands, their help, and the dispatch to their implementations.
 
+mod attended;
 mod bench;
 mod bench_learner;
 mod bench_policy;
@@ -19,8 +20,11 @@ mod doctor;
 mod env;
 mod eval;
 mod export;
+mod hub;
 mod output;
 mod play;
+mod pull;
+mod push;
 mod record;
 mod report;
 mod resume;
@@ -108,6 +112,10 @@ enum Command {
     Play(play::PlayArgs),
     /// Export a run's policy to one file, for a robot or an ONNX runtime.
     Export(export::ExportArgs),
+    /// Upload a run's policy to the Hugging Face hub, with a model card.
+    Push(push::PushArgs),
+    /// Download a policy from the Hugging Face hub.
+    Pull(pull::PullArgs),
     /// Benchmark a part of the system against alternatives.
     Bench(bench::BenchArgs),
     /// Kill a run's processes on a schedule and check that no data is lost.
@@ -226,6 +234,8 @@ fn run(command: Command) -> anyhow::Result<Outcome> {
         Command::Record(args) => record::run(&args),
         Command::Play(args) => play::run(&args),
         Command::Export(args) => export::run(&args),
+        Command::Push(args) => push::run(&args),
+        Command::Pull(args) => pull::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Chaos(args) => chaos::run(&args),
         Command::Bridge(args) => bridge::run(&args),

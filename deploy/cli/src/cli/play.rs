@@ -1,25 +1,19 @@
 //! `dmprl play`: shows a policy live.
 
 use std::path::PathBuf;
-use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+use std::process::Command;
 
 use anyhow::{Context, bail};
 use clap::Args;
 use dmprl_analysis::export::{read_policy, safetensors};
 use dmprl_run::PolicyChoice;
-use dmprl_run::Watch;
 use dmprl_run::failure::Outcome;
-use rustix::process::{Pid, Signal, kill_process};
 
+use super::attended::attend;
 use super::trust::TrustArgs;
 use super::{open_run, prepare_python_with};
 use crate::terminal::say;
 
-/// Interval between checks for exit and interrupt.
-const CHECK_INTERVAL: Duration = Duration::from_millis(50);
-/// Grace period after the interrupt, before the player is killed.
-const GRACE_PERIOD: Duration = Duration::from_secs(5);
 /// Extra of the Python package for rendering.
 const EXTRA: &str = "video";
 
@@ -85,7 +79,11 @@ pub(super) fn run(args: &PlayArgs) -> anyhow::Result<Outcome> {
     } else {
         say("open this page in a browser (Ctrl-C to stop):");
     }
-    play(command)
+    match attend(command)? {
+        None => Ok(Outcome::Interrupted),
+        Some(status) if status.success() => Ok(Outcome::Done),
+        Some(status) => bail!("the player ended with {status}; its output is above"),
+    }
 }
 
 /// Detects X11 or Wayland.
@@ -93,42 +91,4 @@ fn has_display() -> bool {
     ["DISPLAY", "WAYLAND_DISPLAY"]
         .into_iter()
         .any(|name| std::env::var_os(name).is_some_and(|value| !value.is_empty()))
-}
-
-/// Runs the player until it ends or the user interrupts.
-fn play(mut command: Command) -> anyhow::Result<Outcome> {
-    let watch = Watch::start()?;
-    // The player has its own process group, so that it does not get the terminal's interrupt; this
-    // process forwards it once.
-    std::os::unix::process::CommandExt::process_group(&mut command, 0);
-    // SAFETY: `prctl` is async-signal-safe, allocates nothing and touches no lock.
-    unsafe {
-        std::os::unix::process::CommandExt::pre_exec(&mut command, || {
-            rustix::process::set_parent_process_death_signal(Some(Signal::TERM)).map_err(Into::into)
-        });
-    }
-    let mut player = command.stdin(Stdio::null()).spawn().context("cannot start the player")?;
-    let id = i32::try_from(player.id()).ok().and_then(Pid::from_raw);
-    let mut interrupted_at: Option<Instant> = None;
-    loop {
-        if let Some(status) = player.try_wait().context("cannot wait for the player")? {
-            return match status.code() {
-                _ if interrupted_at.is_some() => Ok(Outcome::Interrupted),
-                Some(0) => Ok(Outcome::Done),
-                _ => bail!("the player ended with {status}; its output is above"),
-            };
-        }
-        match interrupted_at {
-            None if watch.check().is_err() => {
-                interrupted_at = Some(Instant::now());
-                // Fails harmlessly if the player has exited meanwhile.
-                let _ = id.map(|id| kill_process(id, Signal::INT));
-            }
-            Some(at) if at.elapsed() > GRACE_PERIOD => {
-                let _ = player.kill();
-            }
-            _ => {}
-        }
-        std::thread::sleep(CHECK_INTERVAL);
-    }
 }
