@@ -11,11 +11,13 @@ use super::{HostPython, LinkedPython, PythonError, loaded_python_version};
 /// Python code that finds the facts of this Python.
 const FACTS: &CStr = c"\
 import os, sys
+from importlib.metadata import distribution
 from importlib.util import find_spec
 executable, prefix, base_prefix = sys.executable, sys.prefix, sys.base_prefix
 base_executable = getattr(sys, '_base_executable', None) or executable
 packages = os.path.dirname(os.path.dirname(find_spec('dmprl').origin))
-simulates = all(find_spec(name) is not None for name in ('gymnasium', 'mujoco'))
+found = distribution('dmprl')
+metadata = next(found.locate_file(file) for file in found.files if file.name == 'METADATA')
 ";
 
 static HOST: OnceLock<(HostPython, LinkedPython)> = OnceLock::new();
@@ -37,7 +39,7 @@ pub fn enter(py: Python<'_>, program: PathBuf) -> PyResult<()> {
         executable: path("executable")?,
         prefix: path("prefix")?,
         packages: path("packages")?,
-        simulates: value("simulates")?.extract()?,
+        metadata: path("metadata")?,
     };
     let base_prefix = text("base_prefix")?;
     let installation = LinkedPython {
@@ -72,10 +74,9 @@ pub(super) fn start(venv: &Path) -> Result<(), PythonError> {
     let resolved = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.to_owned());
     match host() {
         Some(host) if resolved(&host.prefix) == resolved(venv) => Ok(()),
-        host => Err(PythonError::OtherInstallation {
-            venv: venv.to_owned(),
-            expected: host.map_or_else(String::new, |host| host.prefix.display().to_string()),
-            got: venv.display().to_string(),
+        host => Err(PythonError::AlreadyStarted {
+            running: host.map_or_else(String::new, |host| host.prefix.display().to_string()),
+            asked: venv.display().to_string(),
         }),
     }
 }

@@ -6,8 +6,13 @@
 #![cfg(feature = "module")]
 
 use std::ffi::OsString;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
+use dmprl::cli;
 use pyo3::prelude::*;
+
+/// Exit status of an executable that has panicked.
+const PANIC_STATUS: i32 = 101;
 
 /// The module `dmprl_command._program`.
 #[pymodule]
@@ -22,8 +27,8 @@ mod _program {
         let program = words.first().cloned().unwrap_or_default();
         dmprl_actors::python_env::enter(py, program.into())?;
         // SAFETY: The script has started no thread.
-        let status = py.detach(|| unsafe { dmprl::cli::main(words) });
+        let status = py.detach(|| catch_unwind(AssertUnwindSafe(|| unsafe { cli::main(words) })));
         // Python is not shut down, because threads may still use it.
-        std::process::exit(status.into())
+        std::process::exit(status.map_or(PANIC_STATUS, i32::from))
     }
 }

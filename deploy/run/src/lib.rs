@@ -4,6 +4,7 @@
 //! The other crates of `deploy` build on this one. It starts no process and draws nothing.
 
 mod atomic;
+mod command_line;
 mod directory;
 mod exit_status;
 pub mod failure;
@@ -30,6 +31,7 @@ mod watch;
 mod zoo;
 
 pub use atomic::replace as replace_file;
+pub use command_line::words_after_program;
 pub use directory::{RunDirectory, TOKEN_FILE, safe_name};
 pub use exit_status::{ENV_HUNG_STATUS, describe};
 pub use file_system::FileSystem;

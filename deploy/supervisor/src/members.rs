@@ -4,6 +4,7 @@
 use std::fs;
 
 use anyhow::Context;
+use dmprl_run::words_after_program;
 use rustix::process::{Pid, Signal, kill_process};
 
 /// Role of a process in its run.
@@ -51,19 +52,18 @@ pub fn members(supervisor: Pid) -> anyhow::Result<Vec<Member>> {
             return None;
         }
         let line = fs::read(format!("/proc/{name}/cmdline")).ok()?;
-        Some(Member { role: role(&String::from_utf8_lossy(&line))?, pid })
+        Some(Member { role: role(&words_after_program(&line))?, pid })
     };
     Ok(entries.flatten().filter_map(|entry| child(entry.file_name().to_str()?)).collect())
 }
 
-fn role(command_line: &str) -> Option<Role> {
-    let words: Vec<&str> = command_line.split('\0').collect();
+fn role(words: &[String]) -> Option<Role> {
     let number = |flag| {
-        let at = words.iter().position(|word| *word == flag)?;
+        let at = words.iter().position(|word| word == flag)?;
         words.get(at + 1)?.parse::<u64>().ok()
     };
     let small = |flag| u32::try_from(number(flag)?).ok();
-    match *words.get(1)? {
+    match words.first()?.as_str() {
         "actor" => Some(Role::Worker(small("--index")?, small("--incarnation")?)),
         "learner" => Some(Role::Learner(number("--restarts").unwrap_or(0))),
         "evaluator" => Some(Role::Evaluator),
@@ -125,13 +125,14 @@ mod tests {
 
     #[test]
     fn roles_are_read_from_the_launchers_command_lines() {
-        let read = |line: &str| role(&line.replace(' ', "\0"));
+        let read = |line: &str| role(&words_after_program(line.replace(' ', "\0").as_bytes()));
         let worker = "dmprl actor --index 1 --incarnation 65538 --run /r --venv /v";
         assert_eq!(read(worker), Some(Role::Worker(1, 65_538)));
         assert_eq!(read("dmprl learner --run /r --domain /d"), Some(Role::Learner(0)));
         let learner = "dmprl learner --run /r --resume --restarts 7";
         assert_eq!(read(learner), Some(Role::Learner(7)));
         assert_eq!(read("dmprl evaluator --run /r"), Some(Role::Evaluator));
+        assert_eq!(read("/v/bin/python /v/bin/dmprl evaluator --run /r"), Some(Role::Evaluator));
         assert_eq!(read("dmprl train reacher"), None);
         assert_eq!(read(""), None);
     }

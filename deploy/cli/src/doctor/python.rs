@@ -152,7 +152,13 @@ fn packages(venv: &Path) -> Check {
         // Importing may print; the versions come last.
         Ok(text) => Check::ok(NAME, text.lines().last().unwrap_or_default()),
         Err(error) => {
-            let advice = format!("rename {}; the next train creates it again", venv.display());
+            let advice = match host() {
+                None => format!("rename {}; the next train creates it again", venv.display()),
+                Some(host) => {
+                    let python = host.executable.display();
+                    format!("{python} -m pip install --force-reinstall 'dmprl[sim]'")
+                }
+            };
             Check::problem(NAME, format!("cannot be imported: {error}"), advice)
         }
     }

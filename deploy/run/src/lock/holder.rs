@@ -5,6 +5,8 @@ use std::fs;
 
 use serde::{Deserialize, Serialize};
 
+use crate::words_after_program;
+
 /// A process that holds, or last held, the lock of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Holder {
@@ -69,9 +71,9 @@ impl Holder {
     /// even a short hold of the lock could make a concurrent resume fail.
     pub(crate) fn is_trainer_here(&self) -> bool {
         let here = self.origin.is_none() || self.is_on_this_machine();
-        let command = command_line(self.pid);
-        let command = command.split(|&byte| byte == 0).nth(1).unwrap_or_default();
-        here && self.is_running() && [b"train".as_slice(), b"resume", b"chaos"].contains(&command)
+        let words = words_after_program(&command_line(self.pid));
+        let command = words.first().map_or("", String::as_str);
+        here && self.is_running() && ["train", "resume", "chaos"].contains(&command)
     }
 
     /// Returns true if a process of this machine with this id, and this start if it is known, is

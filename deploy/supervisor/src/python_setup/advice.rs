@@ -46,8 +46,9 @@ pub(super) fn advice(output: &str) -> String {
         }
         Cause::NoPip => match host().map(|host| host.executable.display()) {
             Some(python) => format!(
-                "{python} has no pip, with which dmprl installs packages. Add it: uv pip install \
-                 pip, or {python} -m ensurepip\n"
+                "{python} has no pip, with which dmprl installs packages. Add it ({python} -m \
+                 ensurepip, or uv pip install --python {python} pip), or install dmprl with the \
+                 parts that you use, such as 'dmprl[sim,video]'\n"
             ),
             None => {
                 format!(

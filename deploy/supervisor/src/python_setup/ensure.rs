@@ -85,6 +85,9 @@ pub(super) fn ensure_installed(
     progress: &dyn Fn(&str),
 ) -> Result<PythonEnvironment> {
     let environment = PythonEnvironment::of(home.venv());
+    if matches!(home, Home::Installed(host) if host.has_extra(extra)) {
+        return Ok(environment);
+    }
     let declared = Declared::read(&home.requirements())?;
     let requirements = declared.extra(extra)?;
     let locked_packages = match home {
@@ -97,7 +100,10 @@ pub(super) fn ensure_installed(
         text += &packages.with_context(|| format!("cannot read {}", path.display()))?;
     }
     let stamp = together::extra_stamp(&environment.venv, extra);
-    let is_ready = || fs::read_to_string(&stamp).is_ok_and(|found| found == text);
+    let is_ready = || match home {
+        Home::Clone(_) => fs::read_to_string(&stamp).is_ok_and(|found| found == text),
+        Home::Installed(host) => host.has_extra(extra),
+    };
     if is_ready() {
         return Ok(environment);
     }

@@ -43,7 +43,6 @@ impl Home {
     pub fn ensure(&self, progress: &dyn Fn(&str)) -> Result<PythonEnvironment> {
         match self {
             Self::Clone(root) => ensure(root, progress),
-            Self::Installed(host) if host.simulates => Ok(PythonEnvironment::of(self.venv())),
             Self::Installed(_) => ensure_installed(self, SIMULATION, progress),
         }
     }
@@ -53,7 +52,8 @@ impl Home {
     pub fn state(&self) -> State {
         match self {
             Self::Clone(root) => state(root),
-            Self::Installed(_) => State::Ready,
+            Self::Installed(host) if host.has_extra(SIMULATION) => State::Ready,
+            Self::Installed(_) => State::Stale("no MuJoCo and Gymnasium, or old ones".to_owned()),
         }
     }
 
@@ -95,12 +95,7 @@ impl Home {
     pub(super) fn requirements(&self) -> PathBuf {
         match self {
             Self::Clone(root) => root.join(PACKAGE).join("pyproject.toml"),
-            Self::Installed(host) => metadata(host),
+            Self::Installed(host) => host.metadata.clone(),
         }
     }
-}
-
-/// Metadata of the package, as pip installed it.
-fn metadata(host: &HostPython) -> PathBuf {
-    host.packages.join(format!("dmprl-{}.dist-info", env!("CARGO_PKG_VERSION"))).join("METADATA")
 }
