@@ -124,7 +124,10 @@ def pull(repo: str, *, quiet: bool = True, **flags: Any) -> Run:
     :param quiet: suppresses progress.
     :param flags: flags of ``dmprl pull``: ``revision=...``, ``output=...`` another run directory.
     :raises dmprl.ProgramError: if it cannot be downloaded; the message gives the reason.
+    :raises ValueError: if the output is a policy file; ``dmprl pull`` writes that.
     """
+    if str(flags.get("output", "")).endswith(".safetensors"):
+        raise ValueError(f"output {flags['output']}: expected a run directory, not a policy file")
     arguments = [repo, "--json", *program.flags(flags)]
     return Run(json.loads(program.call("pull", *arguments, quiet=quiet))["path"])
 

@@ -83,9 +83,16 @@ class CardTest(unittest.TestCase):
         config["task"] |= {"name": 'a: "b"\n- c', "id": "arms:Arm-v0"}
         head = card.metadata(facts(config=config))
         self.assertIn('      name: "a: \\"b\\"\\n- c"\n', head)
-        self.assertIn(
-            "`arms:Arm-v0` does not come with dmprl", card.description(facts(config=config))
-        )
+        self.assertIn("in the Python module `arms`", card.description(facts(config=config)))
+        config["task"]["id"] = "Reacher-v5"  # of Gymnasium, as the task `reacher`
+        self.assertNotIn("module", card.description(facts(config=config)))
+
+    def test_all_sessions_of_a_resumed_run_are_listed(self):
+        manifest = facts().manifest
+        again = {**manifest["sessions"][0], "command": ["dmprl", "resume", "mine"]}
+        manifest = {**manifest, "sessions": [*manifest["sessions"], again]}
+        text = card.training(facts(manifest=manifest))
+        self.assertIn("algorithm.discount=0.95\ndmprl resume mine\n```", text)
 
 
 if __name__ == "__main__":

@@ -111,7 +111,7 @@ class HubTest(unittest.TestCase):
         error = self.push(status=REFUSED, token="hf_wrong")["error"]
         self.assertIn("does not accept the token", error)
         error = self.push(status=REFUSED, token=hub_stand_in.READER)["error"]
-        self.assertIn(f"may not write to {self.hub.address}/{REPO}", error)
+        self.assertIn(f"may not do this with {self.hub.address}/{REPO}", error)
         error = self.push(status=REFUSED, repo="you/push")["error"]
         self.assertIn("expected one with write access for you", error)
 

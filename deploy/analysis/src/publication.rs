@@ -20,9 +20,9 @@ const AROUND_PATHS: [char; 9] = ['=', ',', '\'', '"', '[', ']', '{', '}', ' '];
 
 /// Writes the policy and the files of its run that a copy needs into `folder`, which is created.
 ///
-/// Absolute paths in command lines are shortened to their last part, and the configuration names
-/// neither folders nor other hosts, except in arguments of the environment. Evaluations of other
-/// policies are written without the returns of their episodes.
+/// Absolute paths in command lines are shortened to their last part, and other hosts are removed
+/// from them. The configuration names neither, except in arguments of the environment. Evaluations
+/// of other policies are written without the returns of their episodes.
 ///
 /// # Errors
 /// A file of the run cannot be read, or an I/O error.
@@ -53,6 +53,8 @@ pub fn as_run(folder: &Path) -> anyhow::Result<(RunDirectory, ChosenPolicy)> {
     let file = folder.join(POLICY_FILE);
     let version = policy_file::open(&file)?.snapshot.version;
     let run = RunDirectory::open(folder)?;
+    // A repository that was not made by `push` may name folders and hosts of this machine.
+    run.write_config(&without_folders(run.config()?))?;
     let rows = run.evaluations()?;
     let Some(row) = rows.into_iter().rfind(|row| row.policy_version == version) else {
         bail!("{} has no row of policy {version}", run.evaluations_path().display());
@@ -83,6 +85,12 @@ fn without_folders_of(mut manifest: Manifest) -> Manifest {
     manifest.init_from = manifest.init_from.map(|path| last_part(&path).to_owned());
     for session in &mut manifest.sessions {
         for (index, word) in session.command.iter_mut().enumerate() {
+            if let Some((key, _)) = word.split_once('=')
+                && key.starts_with("bridge.")
+            {
+                *word = format!("{key}=…");
+                continue;
+            }
             let parts = word.split_inclusive(AROUND_PATHS);
             let is_path = |part: &str| index == 0 || part.starts_with('/');
             *word = parts.map(|part| if is_path(part) { last_part(part) } else { part }).collect();
@@ -125,6 +133,8 @@ mod tests {
             "/home/me/demos.npz",
             "--set",
             "demonstrations.files=['/home/me/a.npz','/home/me/b.npz']",
+            "--set",
+            "bridge.listen=['tls/10.0.0.1:7447']",
         ]
         .map(str::to_owned)
         .into();
@@ -139,6 +149,8 @@ mod tests {
             "demos.npz",
             "--set",
             "demonstrations.files=['a.npz','b.npz']",
+            "--set",
+            "bridge.listen=…",
         ];
         assert_eq!(manifest.sessions[0].command, expected);
     }

@@ -1,7 +1,7 @@
 //! Reads the commands of running processes.
 
-/// Returns the words of `/proc/PID/cmdline` after the program `dmprl`. In an installed package, that
-/// is a script of Python: `python dmprl train`.
+/// Returns the words of `/proc/PID/cmdline` after the program `dmprl`. In an installed package,
+/// that is a script of Python: `python dmprl train`.
 #[must_use]
 pub fn words_after_program(command_line: &[u8]) -> Vec<String> {
     let words = command_line.split(|&byte| byte == 0);

@@ -47,7 +47,7 @@ def push(arguments: argparse.Namespace, hub: Hub) -> str:
         files[name] = film
         address = f"{hub.address}/resolve/main/{name}"
     facts = card.read(folder, arguments.repo, arguments.policy_version, address)
-    files[README].write_text(card.model_card(facts))
+    files[README].write_text(card.model_card(facts), encoding="utf-8")
     kib = sum(path.stat().st_size for path in files.values()) / 1024
     print(f"uploading {len(files)} files ({kib:,.0f} KiB) to {hub.address}", file=sys.stderr)
     return hub.upload(files, arguments.message)

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 
-OWN_TASKS = "dmprl/"
-"""Begins the ids of the tasks that come with dmprl."""
 VERSIONS = ("python", "mujoco", "gymnasium", "numpy")
 """Packages that a manifest names."""
 
@@ -54,12 +52,12 @@ class Facts:
 
 def read(folder: Path, repo: str, policy_version: int, film: str | None) -> Facts:
     """Reads the files of a repository that is about to be uploaded."""
-    lines = (folder / "evaluations.jsonl").read_text().splitlines()
+    lines = (folder / "evaluations.jsonl").read_text(encoding="utf-8").splitlines()
     return Facts(
         repo=repo,
-        config=tomllib.loads((folder / "config.toml").read_text()),
-        spec=json.loads((folder / "spec.json").read_text()),
-        manifest=json.loads((folder / "manifest.json").read_text()),
+        config=tomllib.loads((folder / "config.toml").read_text(encoding="utf-8")),
+        spec=json.loads((folder / "spec.json").read_text(encoding="utf-8")),
+        manifest=json.loads((folder / "manifest.json").read_text(encoding="utf-8")),
         rows=[json.loads(line) for line in lines],
         policy_version=policy_version,
         film=film,
@@ -123,10 +121,11 @@ def description(facts: Facts) -> str:
         f"A policy that dmprl trained. From an observation of {spec['observation_len']} entries it "
         f"computes {outputs[policy['kind']]} of {spec['action_len']} entries."
     )
-    if not task_id.startswith(OWN_TASKS):
+    module, colon, _ = task_id.partition(":")
+    if colon:
         text += (
-            f" The task `{task_id}` does not come with dmprl. To play the policy, install the "
-            "task's package, or name its folder with `dmprl pull --python-path`."
+            f" The task is in the Python module `{module}`. To play the policy, install it, or "
+            "name its folder with `dmprl pull --python-path`."
         )
     return text
 
@@ -192,11 +191,13 @@ actions = policy.segment(observation)  # (K, {facts.spec["action_len"]})
 
 def training(facts: Facts) -> str:
     """States how the policy was trained."""
-    session = facts.manifest["sessions"][0]
+    sessions = facts.manifest["sessions"]
+    commands = "".join(f"{shlex.join(session['command'])}\n" for session in sessions)
+    session = sessions[-1]
     commit = f", commit {session['git_commit']}" if session["git_commit"] else ""
     packages = session.get("packages") or {}
     versions = [f"{name} {packages[name]}" for name in VERSIONS if packages.get(name)]
-    text = f"```text\n{shlex.join(session['command'])}\n```\n\n"
+    text = f"```text\n{commands}```\n\n"
     text += f"dmprl {session['dmprl_version']}{commit}"
     text += f"; {', '.join(versions)}. " if versions else ". "
     return text + "`config.toml` has the whole configuration."

@@ -161,8 +161,9 @@ class Hub:
             )
         if status == FORBIDDEN:
             return RefusedError(
-                f"the token may not write to {self.address}: expected one with write access for "
-                f"{self._repo.partition('/')[0]}; create one at {self.endpoint}/settings/tokens"
+                f"the token may not do this with {self.address}: expected one with write access "
+                f"(to pull, read access) for {self._repo.partition('/')[0]}; create one at "
+                f"{self.endpoint}/settings/tokens"
             )
         said = error.server_message or first_line(error)
         return HubError(f"{self.address}: the hub answered with status {status}: {said}")

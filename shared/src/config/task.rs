@@ -98,6 +98,16 @@ impl TaskConfig {
             let expected = format!("expected {expected}");
             Err(RangeError { key, expected, got: got.to_owned() })
         };
+        // They are shown before code is trusted, and must not be able to hide a line.
+        for (key, texts) in [
+            ("task.name", std::slice::from_ref(&self.name)),
+            ("task.id", std::slice::from_ref(&self.id)),
+            ("task.python_path", &self.python_path),
+        ] {
+            if let Some(text) = texts.iter().find(|text| text.chars().any(char::is_control)) {
+                return range(key, "no control characters", &format!("{text:?}"));
+            }
+        }
         if let Some(name) = self.wrappers.iter().find(|name| !is_python_object(name)) {
             return range("task.wrappers", "module:function or module:Class", name);
         }
@@ -155,6 +165,18 @@ mod tests {
         task.id = "my.arms:Arm".into();
         task.wrappers = vec!["tools:slow".into(), "my.arms:scale".into()];
         assert_eq!(task.imports().into_iter().collect::<Vec<_>>(), ["my.arms", "tools"]);
+    }
+
+    #[test]
+    fn names_cannot_hide_lines_of_a_terminal() {
+        for (key, value) in [
+            ("task.name", "arm\u{1b}[2K"),
+            ("task.id", "arm\rx"),
+            ("task.python_path", r#"["a\nb"]"#),
+        ] {
+            let error = layered(&[(key, value)]).unwrap_err().to_string();
+            assert!(error.contains("no control characters"), "{key}: {error}");
+        }
     }
 
     #[test]

@@ -72,6 +72,9 @@ fn a_pushed_policy_is_pulled_evaluated_and_trained_from() {
     let warm = ["--steps", "600", "--init-from", "runs/me-reacher"];
     place.run(&train("reacher", &place.path("warm"), &warm)).with_status(0);
     dmprl(&place, &["pull", "me/reacher"]).with_status(0);
+    let export = ["export", "runs/me-reacher", "--json"];
+    let exported = dmprl(&place, &export).with_status(0).json();
+    assert_eq!(exported["hold"], "zero-torque", "the hold of the uploaded file");
 
     // Only the policy, byte for byte.
     let file = ["pull", "me/reacher", "--revision", commit, "--output", "policy.safetensors"];

@@ -37,7 +37,9 @@ pub fn read_policy(run: &RunDirectory, chosen: &ChosenPolicy) -> anyhow::Result<
         return_mean: chosen.row.as_ref().map(|row| row.return_mean),
         success_rate: chosen.row.as_ref().and_then(|row| row.success_rate),
     };
-    Ok(OpenedPolicy { policy, snapshot, origin: Some(origin), hold: None })
+    // A run knows no robot, but a downloaded policy may.
+    let hold = policy_file::open(&chosen.path).ok().and_then(|opened| opened.hold);
+    Ok(OpenedPolicy { policy, snapshot, origin: Some(origin), hold })
 }
 
 /// Encodes a policy in the project's own format.

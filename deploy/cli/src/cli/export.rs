@@ -130,7 +130,7 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
             "success_rate": row.and_then(|row| row.success_rate),
             "observation_len": opened.policy.env_observation_len(),
             "segment_steps": layout.segment_steps, "action_len": layout.action_len,
-            "hold": args.hold.as_ref().map(Hold::to_string),
+            "hold": opened.hold.as_ref().map(Hold::to_string),
         })
         .to_string()
     } else {
@@ -141,7 +141,7 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
             binary_bytes(bytes),
             chosen.version
         );
-        let held = args.hold.as_ref().map_or_else(
+        let held = opened.hold.as_ref().map_or_else(
             || "no hold stated; for a robot, export with --hold".to_owned(),
             |hold| format!("held by {hold}"),
         );

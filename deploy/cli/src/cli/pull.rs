@@ -22,7 +22,8 @@ continue it. With an output NAME.safetensors it writes only the policy file, for
 `dmprl.Policy.load`.
 
 Public repositories need no token; for private ones see `dmprl push --help`. Downloading imports no
-code. If the task does not come with dmprl, the first command that runs it asks for --trust-code.
+code. If the configuration names modules or arguments of the environment, the first command that
+creates it lists them and asks for --trust-code.
 
 EXAMPLES
   dmprl pull me/panda-push                          # runs/me-panda-push
@@ -59,6 +60,13 @@ pub(super) fn run(args: &PullArgs) -> anyhow::Result<Outcome> {
     let is_file = output.extension().is_some_and(|end| end == "safetensors");
     if is_file {
         check_output(&output)?;
+        if !args.python_path.is_empty() {
+            return Err(wrong_use(format!(
+                "--python-path is for a run directory, and {} is a policy file, which has no place \
+                 for it; leave one of them out",
+                output.display()
+            )));
+        }
     }
     let folders = args.python_path.iter().map(|folder| absolute_folder(&folder.to_string_lossy()));
     let python_path = folders.collect::<anyhow::Result<Vec<_>>>()?;

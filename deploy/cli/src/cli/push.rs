@@ -23,11 +23,11 @@ const HELP: &str = "\
 Creates the repository if it does not exist. Uploads, in one commit, policy.safetensors as `dmprl
 export` writes it, the run's configuration and evaluations, and a model card with task, result,
 seeds and the commands that use the policy; with a video of the policy that `dmprl record` made in
-the run directory. Folders of this machine are removed from configuration and command line;
-arguments of the environment (task.kwargs) are uploaded as they are.
+the run directory. Folders are removed from the configuration, and absolute paths shortened in the
+command line; arguments of the environment (task.kwargs) are uploaded as they are.
 
-The token with write access is that of HF_TOKEN or of a login, `.venv/bin/hf auth login`.
-HF_ENDPOINT selects another hub than huggingface.co.
+The token with write access is that of HF_TOKEN or of a login, whose command is shown if neither
+exists. HF_ENDPOINT selects another hub than huggingface.co.
 
 EXAMPLES
   dmprl push runs/mine me/panda-push
