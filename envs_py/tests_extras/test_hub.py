@@ -113,7 +113,7 @@ class HubTest(unittest.TestCase):
         error = self.push(status=REFUSED, token=hub_stand_in.READER)["error"]
         self.assertIn(f"may not do this with {self.hub.address}/{REPO}", error)
         error = self.push(status=REFUSED, repo="you/push")["error"]
-        self.assertIn("expected one with write access for you", error)
+        self.assertIn("(to pull, read access) for you; create one at", error)
 
     def test_other_repositories_are_refused_with_their_files(self):
         error = self.pull(status=REFUSED)["error"]
