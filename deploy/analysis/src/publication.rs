@@ -1,6 +1,6 @@
 //! A policy as the files of a repository on a model hub, and as a run directory again.
 //!
-//! `dmprl push` uploads the files that [`write`] writes. `dmprl pull` downloads them, and
+//! `dmprl push` uploads the files that [`fn@write`] writes. `dmprl pull` downloads them, and
 //! [`as_run`] turns their folder into a run directory with one policy.
 
 use std::fs;
