@@ -11,9 +11,6 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use dmprl::cli;
 use pyo3::prelude::*;
 
-/// Exit status of an executable that has panicked.
-const PANIC_STATUS: i32 = 101;
-
 /// The module `dmprl_command._program`.
 #[pymodule]
 mod _program {
@@ -29,6 +26,6 @@ mod _program {
         // SAFETY: The script has started no thread.
         let status = py.detach(|| catch_unwind(AssertUnwindSafe(|| unsafe { cli::main(words) })));
         // Python is not shut down, because threads may still use it.
-        std::process::exit(status.map_or(PANIC_STATUS, i32::from))
+        std::process::exit(status.map_or(cli::PANIC_STATUS, i32::from))
     }
 }

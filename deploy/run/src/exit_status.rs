@@ -5,6 +5,8 @@ use std::process::ExitStatus;
 
 /// Exit status of a process that ended itself because an environment hung.
 pub const ENV_HUNG_STATUS: i32 = 75;
+/// Exit status of a program that panicked.
+pub const PANIC_STATUS: i32 = 101;
 
 /// Describes an exit status, such as `exit status 3` or `signal 9 (SIGKILL), perhaps out of
 /// memory`.

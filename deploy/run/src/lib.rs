@@ -33,7 +33,7 @@ mod zoo;
 pub use atomic::replace as replace_file;
 pub use command_line::words_after_program;
 pub use directory::{RunDirectory, TOKEN_FILE, safe_name};
-pub use exit_status::{ENV_HUNG_STATUS, describe};
+pub use exit_status::{ENV_HUNG_STATUS, PANIC_STATUS, describe};
 pub use file_system::FileSystem;
 pub use lock::{Holder, LEASE_TIMEOUT, LockWatch, RunLock};
 pub use log_tail::last_lines;

@@ -8,7 +8,7 @@ use std::fmt::{self, Display, Formatter};
 use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
-use dmprl_run::describe;
+use dmprl_run::{PANIC_STATUS, describe};
 
 use super::children::{Running, Slot};
 use super::launcher::INCARNATIONS_PER_SESSION;
@@ -18,8 +18,6 @@ use super::process::Process;
 /// Maximum number of the evaluator's restarts without an answer in between. Then the run stops: a
 /// run without evaluations is not worth its computing time.
 pub(super) const EVALUATOR_RESTARTS_MAX: u32 = 3;
-/// Exit status of a program that panicked.
-const PANIC_STATUS: i32 = 101;
 
 /// How a process ended: by itself, or killed by the supervisor for a reason.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -51,6 +51,7 @@ use crate::roles::{
 };
 use crate::terminal::messages::{self, MessageStyle};
 use crate::terminal::{ProgressStyle, TerminalProgress};
+pub use dmprl_run::PANIC_STATUS;
 #[cfg(feature = "python")]
 use dmprl_supervisor::python_setup::{Home, PythonEnvironment, ensure_extra, packages};
 use session::name_limits;

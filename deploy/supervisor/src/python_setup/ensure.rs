@@ -85,9 +85,6 @@ pub(super) fn ensure_installed(
     progress: &dyn Fn(&str),
 ) -> Result<PythonEnvironment> {
     let environment = PythonEnvironment::of(home.venv());
-    if matches!(home, Home::Installed(host) if host.has_extra(extra)) {
-        return Ok(environment);
-    }
     let declared = Declared::read(&home.requirements())?;
     let requirements = declared.extra(extra)?;
     let locked_packages = match home {
