@@ -11,6 +11,7 @@ import importlib
 import inspect
 import sys
 from abc import ABC, abstractmethod
+from pathlib import Path
 from types import ModuleType
 from typing import NotRequired, TypedDict
 
@@ -349,10 +350,18 @@ def _import(task_id: str, module_name: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise  # the module exists, but one of its imports is missing
-        extra = EXTRAS.get(module_name)
         raise ModuleNotFoundError(
             f"{task_id}: no module {error.name!r} among the installed packages or in the "
-            "directories given with --python-path"
-            + (f"; install it with: dmprl env add 'dmprl[{extra}]'" if extra else ""),
+            f"directories given with --python-path{_remedy(module_name)}",
             name=error.name,
         ) from None
+
+
+def _remedy(module_name: str) -> str:
+    if extra := EXTRAS.get(module_name):
+        return f"; install it with: dmprl env add 'dmprl[{extra}]'"
+    here = Path(module_name.partition(".")[0])
+    for found in (here.with_suffix(".py"), here):
+        if found.exists():
+            return f". {found} is in the current folder, so add: --python-path ."
+    return ""

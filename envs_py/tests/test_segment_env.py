@@ -1,6 +1,8 @@
 """The contract of SegmentEnv, tested with Gymnasium environments."""
 
+import contextlib
 import sys
+import tempfile
 import unittest
 from pathlib import Path
 
@@ -271,6 +273,10 @@ class SpecTest(unittest.TestCase):
             make("FetchPush-v4", 1, 5)
         with self.assertRaisesRegex(ModuleNotFoundError, "--python-path"):
             make("no_such_module:Task-v0", 1, 5)
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            Path("my_arms.py").touch()
+            with self.assertRaisesRegex(ModuleNotFoundError, "my_arms.py is in the current folder"):
+                make("my_arms:Arm", 1, 5)
         with self.assertRaisesRegex(gymnasium.error.Error, "the module tiny_envs exists, but"):
             make("tiny_envs:Missing", 1, 5)
 

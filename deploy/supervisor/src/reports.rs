@@ -15,6 +15,10 @@ use super::step::{Action, Admission, Failure};
 const GARBAGE_SHOWN_MAX: u32 = 3;
 /// Maximum number of characters of such a line.
 const GARBAGE_CHARS: usize = 200;
+/// Warning about an environment without a time limit.
+const NO_LIMIT: &str = "the environment has no time limit: an episode ends only when the \
+    environment ends it, and in an evaluation after 10,000 steps. If episodes do not end, add a \
+    limit, such as: --env-kwargs max_episode_steps=500";
 
 impl Machine {
     pub(super) fn on_garbage(&mut self, process: Process, line: &str) {
@@ -124,6 +128,9 @@ impl Machine {
         match &self.spec {
             None => {
                 self.actions.push(Action::WriteSpec(spec.clone()));
+                if spec.episode_steps == 0 {
+                    self.notify(RunEvent::Warning { process: None, message: NO_LIMIT.into() });
+                }
                 self.spec = Some(spec);
             }
             // A run of an older version that is resumed has no goal rule yet.
@@ -385,5 +392,39 @@ impl Machine {
                  try again when a worker has left"
             )
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+    use crate::machine::tests::machine;
+    use crate::simulation::fakes;
+    use crate::step::Event;
+
+    #[test]
+    fn an_environment_without_a_time_limit_is_noted_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let now = Instant::now();
+        let warnings = |episode_steps| {
+            let run = folder.path().join(format!("{episode_steps}"));
+            let mut machine = machine(&run, now);
+            let mut warnings = 0;
+            for index in 0..2 {
+                machine.children.start(Process::Actor(index), now);
+                let spec = EnvSpec { episode_steps, ..fakes::spec() };
+                let report = Report::EnvironmentReady { spec };
+                let actions = machine.step(Event::Report(Process::Actor(index), report), now);
+                let is_warning = |action: &&Action| {
+                    matches!(action, Action::Notify(RunEvent::Warning { message, .. })
+                        if message == NO_LIMIT)
+                };
+                warnings += actions.iter().filter(is_warning).count();
+            }
+            warnings
+        };
+        assert_eq!((warnings(0), warnings(50)), (1, 0));
     }
 }

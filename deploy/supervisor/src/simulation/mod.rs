@@ -16,7 +16,7 @@
 //! a stop, within its time limits. A failed test prints its seed. To run only this seed, set
 //! `DMPRL_SIMULATION_SEED=<seed>`.
 
-mod fakes;
+pub(crate) mod fakes;
 mod scenario;
 mod tally;
 mod world;
