@@ -212,6 +212,8 @@ class Handler(BaseHTTPRequestHandler):
     def file(self, body: bytes, repo: str, revision: str, name: str) -> None:
         """Sends a file."""
         self.check(repo, writes=False)
+        if self.server.state(repo).get("gated"):
+            raise RefusalError(403, "GatedRepo", "Access to this repository is restricted")
         made, folder = self.server.files(repo, revision)
         if folder is None or not (folder / name).is_file():
             raise RefusalError(404, "EntryNotFound", "Entry not found")

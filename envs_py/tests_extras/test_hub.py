@@ -100,6 +100,12 @@ class HubTest(unittest.TestCase):
         )
         self.pull(token=hub_stand_in.READER)
 
+    def test_a_repository_on_request_is_named_as_such(self):
+        self.push()
+        self.hub.write_state(REPO, {**self.hub.state(REPO), "gated": True})
+        error = self.pull(status=REFUSED)["error"]
+        self.assertRegex(error, f"{REPO} is open on request only: ask for access")
+
     def test_a_public_repository_does_not_become_private_unnoticed(self):
         self.push()
         error = self.push("--private", status=REFUSED)["error"]

@@ -16,6 +16,7 @@ from huggingface_hub import (
     hf_hub_download,
 )
 from huggingface_hub.errors import (
+    GatedRepoError,
     HfHubHTTPError,
     HFValidationError,
     HTTPError,
@@ -137,6 +138,11 @@ class Hub:
             raise RefusedError(
                 f"{self.address} has no revision {revision}: expected a branch, a tag or the id of "
                 f"a commit; see {self.address}/commits/main"
+            ) from error
+        except GatedRepoError as error:
+            raise RefusedError(
+                f"{self.address} is open on request only: ask for access on that page, then set "
+                f"HF_TOKEN, or run {LOGIN}"
             ) from error
         except RepositoryNotFoundError as error:
             seen = "it is private and HF_TOKEN or the login may not read it"

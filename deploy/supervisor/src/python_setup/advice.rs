@@ -58,7 +58,7 @@ pub(super) fn advice(output: &str) -> String {
         },
         Cause::DiskFull => "The disk is full.\n".to_owned(),
         Cause::NoNetwork => "The package index cannot be reached. The first start downloads \
-             gymnasium, mujoco and numpy, the first search Optuna, and the first video PyAV; later \
+             gymnasium, mujoco and numpy, and the first use of another part its packages; later \
              starts need no network. Behind a proxy, set HTTPS_PROXY. Without a network, set \
              PIP_FIND_LINKS to a directory of the wheels in envs_py/locks and PIP_NO_INDEX=1\n"
             .to_owned(),
