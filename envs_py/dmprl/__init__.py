@@ -50,7 +50,7 @@ __all__ = [
     "pull",
     "train",
 ]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 SHORT_NAMES = {
     "reacher": "dmprl/Reacher-v5",
