@@ -57,10 +57,9 @@ fn package_alone_and_with_the_program_ask_for_the_same() {
 fn the_version_and_the_address_are_the_same_everywhere() {
     let text = |file: &str| std::fs::read_to_string(project_root().join(file)).unwrap();
     let citation = text("CITATION.cff");
-    for (key, value) in [
-        ("version", env!("CARGO_PKG_VERSION")),
-        ("repository-code", env!("CARGO_PKG_REPOSITORY")),
-    ] {
+    for (key, value) in
+        [("version", env!("CARGO_PKG_VERSION")), ("repository-code", env!("CARGO_PKG_REPOSITORY"))]
+    {
         let line = format!("{key}: {value}");
         assert!(citation.lines().any(|it| it == line), "CITATION.cff lacks the line {line:?}");
     }

@@ -7,6 +7,7 @@
 //! - `transport` compares the transport of segments with pipes, sockets and Python's queues. Its
 //!   workers only send.
 //! - `system` measures a complete run.
+//! - `agents` compares the time until a policy is good enough with other libraries.
 //! - `scale` predicts the throughput of many workers from the cost of each part, and measures a
 //!   learner with 256 synthetic workers.
 //! - `policy` compares the latency of a policy with other runtimes.
@@ -14,6 +15,7 @@
 //! Every long wait checks [`dmprl_run::Watch`], so that an interrupt ends the benchmark.
 
 mod adaptive_sleep;
+mod agents;
 mod child;
 mod drain_receiver;
 mod figures;
@@ -33,6 +35,7 @@ mod workers;
 
 use dmprl_run::Progress;
 
+pub use agents::{AgentKind, AgentsBench, Figures as AgentsFigures, agents};
 pub use figures::Figures;
 pub use learner::{Figures as LearnerFigures, LearnerBench, PeerKind, learner};
 pub use numpy_plan::{Controls, NumpyPlan};

@@ -1,4 +1,4 @@
-//! Runs a whole `dmprl train` as a child, for `dmprl chaos` and `dmprl bench system`.
+//! Runs a whole `dmprl train` as a child, for `dmprl chaos` and `dmprl bench`.
 
 use std::fs::File;
 use std::os::unix::process::CommandExt;
@@ -56,6 +56,13 @@ impl WholeRun {
     pub fn end(&mut self) -> anyhow::Result<Option<String>> {
         let status = self.child.try_wait().context("cannot wait for dmprl train")?;
         Ok(status.map(|status| self.describe(status)))
+    }
+
+    /// Returns whether the run succeeded, with a description of a failure; `None` if it has not
+    /// exited.
+    pub fn outcome(&mut self) -> anyhow::Result<Option<Result<(), String>>> {
+        let status = self.child.try_wait().context("cannot wait for dmprl train")?;
+        Ok(status.map(|it| if it.success() { Ok(()) } else { Err(self.describe(it)) }))
     }
 
     fn describe(&self, status: ExitStatus) -> String {

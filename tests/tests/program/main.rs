@@ -9,6 +9,7 @@
 
 mod bench;
 mod bench_learner;
+mod bench_peers;
 mod bench_policy;
 mod bench_scale;
 mod bench_system;

@@ -9,6 +9,7 @@ use dmprl_run::failure::Outcome;
 use dmprl_shared::config::Limits;
 
 use super::bench_learner::{self, LearnerArgs};
+use super::bench_peers::{self, PeersArgs};
 use super::bench_policy::{self, PolicyArgs};
 use super::bench_scale::{self, ScaleArgs};
 use super::bench_system::{self, SystemArgs};
@@ -30,6 +31,7 @@ EXAMPLES
   dmprl bench transport
   dmprl bench policy runs/mine
   dmprl bench system --task reacher
+  dmprl bench peers --task reacher --until-return -5.2
   dmprl bench scale
   dmprl bench learner --help";
 
@@ -70,6 +72,9 @@ pub(super) struct BenchArgs {
 enum Bench {
     /// Measure the time of an update, and compare it with its matrix products, PyTorch and JAX.
     Learner(Box<LearnerArgs>),
+    /// Measure the time until a policy reaches a return or success rate, and compare it with other
+    /// libraries.
+    Peers(Box<PeersArgs>),
     /// Measure the time of a decision of an exported policy, and compare it with NumPy and
     /// onnxruntime.
     Policy(Box<PolicyArgs>),
@@ -114,6 +119,7 @@ struct RolloutArgs {
 pub(super) fn run(args: &BenchArgs) -> anyhow::Result<Outcome> {
     match &args.bench {
         Bench::Learner(args) => bench_learner::run(args),
+        Bench::Peers(args) => bench_peers::run(args),
         Bench::Policy(args) => bench_policy::run(args),
         Bench::Rollout(args) => rollout(args),
         Bench::Scale(args) => bench_scale::run(args),

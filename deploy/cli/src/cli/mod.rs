@@ -3,6 +3,7 @@
 mod attended;
 mod bench;
 mod bench_learner;
+mod bench_peers;
 mod bench_policy;
 mod bench_scale;
 mod bench_system;

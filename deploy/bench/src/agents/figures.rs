@@ -1,0 +1,221 @@
+//! The report of `dmprl bench peers`: one JSON object for programs, a table for people.
+
+use dmprl_run::format::grouped;
+use dmprl_run::{Machine, Progress};
+use dmprl_shared::config::ExperimentConfig;
+use serde_json::{Map, Value, json};
+
+use super::{AgentKind, AgentsBench, Target, Training};
+use crate::statistics::{load_average, max, median, min};
+
+/// Name of our own trainings.
+const OURS: &str = "ours";
+
+/// All trainings of each candidate, ours first.
+#[derive(Debug, Clone)]
+pub struct Figures {
+    config: ExperimentConfig,
+    machine: Machine,
+    load_average: Option<f64>,
+    candidates: Vec<Candidate>,
+}
+
+#[derive(Debug, Clone)]
+struct Candidate {
+    kind: Option<AgentKind>,
+    trainings: Vec<Training>,
+    absent: Option<String>,
+}
+
+impl Candidate {
+    fn name(&self) -> &'static str {
+        self.kind.map_or(OURS, AgentKind::name)
+    }
+
+    fn reached(&self) -> usize {
+        self.trainings.iter().filter(|training| training.reached).count()
+    }
+
+    fn values(&self, value: impl Fn(&Training) -> f64) -> Vec<f64> {
+        self.trainings.iter().map(value).collect()
+    }
+
+    /// Median time; `None` if half of the trainings or more did not reach the target, because their
+    /// times are unknown.
+    fn median_s(&self) -> Option<f64> {
+        let time = |it: &Training| if it.reached { it.seconds } else { f64::INFINITY };
+        median(&self.values(time)).filter(|median| median.is_finite())
+    }
+}
+
+impl Figures {
+    pub(super) fn new(bench: &AgentsBench, machine: Machine) -> Self {
+        let kinds = std::iter::once(None).chain(bench.peers.iter().copied().map(Some));
+        let candidate = |kind| Candidate { kind, trainings: Vec::new(), absent: None };
+        Self {
+            config: bench.config.clone(),
+            machine,
+            load_average: load_average(),
+            candidates: kinds.map(candidate).collect(),
+        }
+    }
+
+    /// Adds a training, and prints its result.
+    pub(super) fn add(
+        &mut self,
+        kind: Option<AgentKind>,
+        training: Training,
+        progress: &dyn Progress,
+    ) {
+        let name = kind.map_or(OURS, AgentKind::name);
+        let (what, steps) = (Target::of(&self.config).name(), grouped(training.env_steps));
+        let value = training.value.map_or_else(|| "none".to_owned(), |value| format!("{value:.2}"));
+        let missed = if training.reached { "" } else { ", target not reached" };
+        progress.print(&format!(
+            "{name}: {what} {value} after {:.1} s and {steps} steps{missed}",
+            training.seconds
+        ));
+        if let Some(candidate) = self.candidates.iter_mut().find(|it| it.kind == kind) {
+            candidate.trainings.push(training);
+        }
+    }
+
+    /// Records why a peer is unavailable.
+    pub(super) fn note(&mut self, kind: AgentKind, why: String) {
+        if let Some(candidate) = self.candidates.iter_mut().find(|it| it.kind == Some(kind)) {
+            candidate.absent = Some(why);
+        }
+    }
+
+    fn ours_s(&self) -> Option<f64> {
+        self.candidates.first().and_then(Candidate::median_s)
+    }
+
+    /// Returns the figures as one JSON object. Unavailable ones are null.
+    #[must_use]
+    pub fn json(&self) -> Value {
+        let target = Target::of(&self.config);
+        let candidates: Map<_, _> = self
+            .candidates
+            .iter()
+            .map(|candidate| {
+                let trainings: Vec<_> = candidate
+                    .trainings
+                    .iter()
+                    .map(|it| {
+                        json!({
+                            "reached": it.reached, "seconds": it.seconds, "start_s": it.start_s,
+                            "evaluation_s": it.evaluation_s, "env_steps": it.env_steps,
+                            "value": it.value,
+                        })
+                    })
+                    .collect();
+                let ratio = candidate.median_s().zip(self.ours_s()).map(|(it, ours)| it / ours);
+                let object = json!({
+                    "median_s": candidate.median_s(), "ratio": ratio,
+                    "reached": candidate.reached(), "trainings": trainings,
+                    "absent": candidate.absent,
+                });
+                (candidate.name().to_owned(), object)
+            })
+            .collect();
+        json!({
+            "task": self.config.task.name,
+            "algorithm": self.config.algorithm.name,
+            "policy": self.config.policy.kind,
+            "target": { "name": target.name(), "value": target.value },
+            "episodes": self.config.evaluation.episodes,
+            "evaluation_interval_steps": self.config.evaluation.interval_steps,
+            "max_minutes": self.config.run.max_minutes,
+            "steps_max": self.config.run.steps,
+            "candidates": candidates,
+            "cpu": self.machine.cpu,
+            "cores": self.machine.cores,
+            "load_average": self.load_average,
+        })
+    }
+
+    /// Returns the figures as a table.
+    #[must_use]
+    pub fn text(&self) -> String {
+        let target = Target::of(&self.config);
+        let mut lines = vec![
+            format!(
+                "{} · {} of {} episodes at least {} · {}, {} cores",
+                self.config.task.name,
+                target.name(),
+                self.config.evaluation.episodes,
+                target.value,
+                self.machine.cpu.as_deref().unwrap_or("unknown processor"),
+                self.machine.cores
+            ),
+            String::new(),
+            format!(
+                "  {:<11}{:>8}  {:>8}  {:<17}{:>9}{:>8}{:>8}{:>8}",
+                "", "reached", "time s", "(range)", "steps", "start", "eval", "ratio"
+            ),
+        ];
+        for candidate in &self.candidates {
+            lines.push(match &candidate.absent {
+                Some(why) => format!("  {:<11}absent: {why}", candidate.name()),
+                None => self.row(candidate),
+            });
+        }
+        lines.extend([
+            String::new(),
+            "time: medians over the seeds, from the start of the process to the target; steps, \
+             start (until the"
+                .to_owned(),
+            "first step) and eval (only evaluation, within time): medians; ratio: time relative to \
+             ours"
+            .to_owned(),
+        ]);
+        lines.join("\n")
+    }
+
+    fn row(&self, candidate: &Candidate) -> String {
+        let count = candidate.trainings.len();
+        let (time, ratio) = match (candidate.median_s(), self.ours_s()) {
+            (Some(time), Some(ours)) => (format!("{time:.1}"), format!("{:.1}", time / ours)),
+            (Some(time), None) => (format!("{time:.1}"), String::new()),
+            (None, _) => ("unknown".to_owned(), String::new()),
+        };
+        let seconds = candidate.values(|it| it.seconds);
+        let middle = |value: fn(&Training) -> f64| median(&candidate.values(value)).unwrap_or(0.0);
+        format!(
+            "  {:<11}{:>8}  {time:>8}  {:<17}{:>9}{:>8.1}{:>8.1}{ratio:>8}",
+            candidate.name(),
+            format!("{}/{count}", candidate.reached()),
+            format!("({:.1} to {:.1})", min(&seconds), max(&seconds)),
+            grouped(middle(|it| it.env_steps as f64) as u64),
+            middle(|it| it.start_s),
+            middle(|it| it.evaluation_s),
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn training(reached: bool, seconds: f64) -> Training {
+        Training {
+            reached,
+            seconds,
+            start_s: 1.0,
+            evaluation_s: 2.0,
+            env_steps: 5000,
+            value: Some(-5.0),
+        }
+    }
+
+    #[test]
+    fn a_training_that_misses_the_target_counts_as_longer_than_any_other() {
+        let candidate = |trainings| Candidate { kind: None, trainings, absent: None };
+        let mostly = vec![training(true, 4.0), training(false, 1.0), training(true, 2.0)];
+        assert_eq!(candidate(mostly).median_s(), Some(4.0));
+        let rarely = vec![training(true, 4.0), training(false, 1.0)];
+        assert_eq!(candidate(rarely).median_s(), None);
+        assert_eq!(candidate(Vec::new()).median_s(), None);
+    }
+}

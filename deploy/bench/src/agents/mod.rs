@@ -1,0 +1,133 @@
+//! `dmprl bench peers`: the time until a policy reaches a target, beside other libraries.
+//!
+//! Every round trains each candidate once with the round's seed, in turns, so that a drift of the
+//! machine's speed affects all alike. `ours` is a whole `dmprl train`, measured from the start of
+//! its process to its end. A peer is a process of `tests/peers/agent_peer.py` (`peer`), measured
+//! from its start to the end of the evaluation that reaches the target. Evaluations, environments
+//! and the number of steps before the first update are the same for all.
+
+mod environment;
+mod figures;
+mod ours;
+mod peer;
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::Context;
+use dmprl_run::{Interrupted, Manifest, Progress, Watch};
+use dmprl_shared::config::ExperimentConfig;
+
+use super::announce_round;
+
+pub use figures::Figures;
+pub use peer::AgentKind;
+
+/// Settings of the benchmark.
+pub struct AgentsBench {
+    /// Path of this program.
+    pub program: PathBuf,
+    /// The resolved configuration of ours. `run.until_return` or `run.until_success` is the target,
+    /// `run.steps` and `run.max_minutes` are the limits of each training.
+    pub config: ExperimentConfig,
+    /// The peers.
+    pub peers: Vec<AgentKind>,
+    /// Number of seeds, beginning with the configured one.
+    pub seeds: u64,
+    /// Python interpreter of the peers; without one, an environment is made for them.
+    pub peer_python: Option<PathBuf>,
+    /// Python interpreter that makes this environment.
+    pub python: PathBuf,
+    /// Folder of this environment.
+    pub environment: PathBuf,
+    /// Folder with the peers' script and requirements.
+    pub peers_path: PathBuf,
+    /// Folder with the package `dmprl`.
+    pub package_path: PathBuf,
+}
+
+/// The value to reach.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Target {
+    is_success: bool,
+    value: f64,
+}
+
+impl Target {
+    fn of(config: &ExperimentConfig) -> Self {
+        let (by_return, by_success) = (config.run.until_return, config.run.until_success);
+        match by_return.is_finite() {
+            true => Self { is_success: false, value: by_return },
+            false => Self { is_success: true, value: by_success },
+        }
+    }
+
+    /// Name of the value in a report.
+    fn name(self) -> &'static str {
+        if self.is_success { "success" } else { "return" }
+    }
+}
+
+/// One training, until the target or a limit.
+#[derive(Debug, Clone, PartialEq)]
+struct Training {
+    reached: bool,
+    /// Time from the start of the process to the end.
+    seconds: f64,
+    /// The part until the first environment step.
+    start_s: f64,
+    /// The part that only evaluates; 0 if evaluations run beside the training.
+    evaluation_s: f64,
+    env_steps: u64,
+    /// Value of the last evaluation; `None` without one.
+    value: Option<f64>,
+}
+
+/// Runs the benchmark; returns `None` if the user interrupted it. Removes all its processes and
+/// files, apart from the peers' environment.
+///
+/// # Errors
+/// The peers' environment cannot be made, or a training fails.
+pub fn agents(bench: &AgentsBench, progress: &dyn Progress) -> anyhow::Result<Option<Figures>> {
+    let watch = Watch::start()?;
+    match measure(bench, &watch, progress) {
+        Err(error) if error.is::<Interrupted>() => Ok(None),
+        result => result.map(Some),
+    }
+}
+
+fn measure(bench: &AgentsBench, watch: &Watch, progress: &dyn Progress) -> anyhow::Result<Figures> {
+    let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
+    let folder = folder.context("cannot make a folder for the trainings")?;
+    let python = match &bench.peer_python {
+        Some(python) => python.clone(),
+        None if bench.peers.is_empty() => bench.python.clone(),
+        None => environment::prepare(bench, watch, progress)?,
+    };
+    let mut figures = Figures::new(bench, Manifest::new(None)?.machine);
+    for round in 0..bench.seeds {
+        announce_round(progress, round as usize, bench.seeds as usize);
+        let mut config = bench.config.clone();
+        config.run.seed += round;
+        progress.detail("ours");
+        let place = folder.path().join(format!("ours-{round}"));
+        let training = ours::train(&bench.program, &config, &place, watch)?;
+        figures.add(None, training, progress);
+        for kind in &bench.peers {
+            progress.detail(kind.name());
+            let place = folder.path().join(format!("{}-{round}", kind.name()));
+            match peer::train(*kind, &python, bench, &config, &place, watch)? {
+                Ok(training) => figures.add(Some(*kind), training, progress),
+                Err(why) => figures.note(*kind, why),
+            }
+        }
+    }
+    Ok(figures)
+}
+
+/// Maximum time of a training, until it counts as hanging.
+fn limit(config: &ExperimentConfig) -> Duration {
+    /// For start and end, and for the evaluation that is running at the limit.
+    const SLACK_S: f64 = 300.0;
+    Duration::from_secs_f64(config.run.max_minutes * 60.0 + SLACK_S)
+}

@@ -1,0 +1,120 @@
+//! One training by another library.
+
+use std::fs::File;
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::Context;
+use clap::ValueEnum;
+use dmprl_run::Watch;
+use dmprl_shared::config::ExperimentConfig;
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use super::{AgentsBench, Target, Training, limit};
+use crate::child::LineChild;
+
+/// An algorithm of another library, with its default settings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
+pub enum AgentKind {
+    /// TD3 of Stable-Baselines3 (PyTorch).
+    Sb3Td3,
+    /// SAC of Stable-Baselines3 (PyTorch).
+    Sb3Sac,
+    /// TD3 of SBX (JAX).
+    SbxTd3,
+    /// SAC of SBX (JAX).
+    SbxSac,
+    /// CrossQ of SBX (JAX).
+    SbxCrossq,
+}
+
+impl AgentKind {
+    /// Name in the script, on the command line and in reports.
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Sb3Td3 => "sb3-td3",
+            Self::Sb3Sac => "sb3-sac",
+            Self::SbxTd3 => "sbx-td3",
+            Self::SbxSac => "sbx-sac",
+            Self::SbxCrossq => "sbx-crossq",
+        }
+    }
+}
+
+/// A line of the script: the state at an evaluation, or at the end.
+#[derive(Debug, Deserialize)]
+struct State {
+    ended: bool,
+    env_steps: u64,
+    value: Option<f64>,
+    start_s: f64,
+    evaluation_s: f64,
+}
+
+/// Trains in the new folder `place`. Returns the reason if the peer is unavailable.
+pub(super) fn train(
+    kind: AgentKind,
+    python: &Path,
+    bench: &AgentsBench,
+    config: &ExperimentConfig,
+    place: &Path,
+    watch: &Watch,
+) -> anyhow::Result<Result<Training, String>> {
+    std::fs::create_dir(place).with_context(|| format!("cannot make {}", place.display()))?;
+    let (settings, log) = (place.join("settings.json"), place.join("log"));
+    std::fs::write(&settings, settings_of(config).to_string())
+        .with_context(|| format!("cannot write {}", settings.display()))?;
+    let errors = File::create(&log).with_context(|| format!("cannot make {}", log.display()))?;
+    let mut command = Command::new(python);
+    command
+        .arg(bench.peers_path.join("agent_peer.py"))
+        .args([kind.name(), "--settings"])
+        .arg(&settings)
+        .arg("--package")
+        .arg(&bench.package_path)
+        .current_dir(place)
+        // Prevents Python from writing next to the sources.
+        .env("PYTHONDONTWRITEBYTECODE", "1")
+        .stderr(errors);
+    let mut child = LineChild::start(kind.name().to_owned(), command, &log)?;
+    if let Err(why) = child.greeting(watch, limit(config))? {
+        return Ok(Err(why));
+    }
+    loop {
+        let line = child.next_line(watch, limit(config), "the next evaluation")?;
+        let seconds = child.started().elapsed().as_secs_f64();
+        let Ok(state) = serde_json::from_str::<State>(&line) else {
+            return Err(child.unexpected_line(&line));
+        };
+        if state.ended {
+            let target = Target::of(config);
+            return Ok(Ok(Training {
+                reached: state.value.is_some_and(|value| value >= target.value),
+                seconds,
+                start_s: state.start_s,
+                evaluation_s: state.evaluation_s,
+                env_steps: state.env_steps,
+                value: state.value,
+            }));
+        }
+    }
+}
+
+fn settings_of(config: &ExperimentConfig) -> Value {
+    let target = Target::of(config);
+    json!({
+        "task": config.task.id,
+        "options": config.task.options_toml(),
+        "python_path": config.task.python_path,
+        "seed": config.run.seed,
+        "steps": config.run.steps,
+        "seconds_max": config.run.max_minutes * 60.0,
+        "learning_starts": config.exploration.warm_up_steps,
+        "evaluation_interval": config.evaluation.interval_steps,
+        "episodes": config.evaluation.episodes,
+        "first_seed": config.evaluation.first_seed,
+        "by_success": target.is_success,
+        "target": target.value,
+    })
+}

@@ -1,0 +1,162 @@
+"""A peer of ``dmprl bench peers``: trains an agent of Stable-Baselines3 or SBX until a target.
+
+``python agent_peer.py sb3-td3|… --settings FILE --package FOLDER`` writes one JSON object a line.
+The first is ``{"ready": "description"}``, or ``{"absent": "why"}`` if it cannot. One follows each
+evaluation, and one ends the training, with ``"ended": true``. It ends with its input, so the death
+of the program that started it ends it too.
+"""
+
+import argparse
+import importlib
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+STARTED = time.monotonic()
+NOISE = 0.1
+"""Standard deviation of TD3's exploration, as in the RL Zoo. The library's default is none."""
+
+AGENTS = {
+    "sb3-td3": ("stable_baselines3", "TD3"),
+    "sb3-sac": ("stable_baselines3", "SAC"),
+    "sbx-td3": ("sbx", "TD3"),
+    "sbx-sac": ("sbx", "SAC"),
+    "sbx-crossq": ("sbx", "CrossQ"),
+}
+
+
+class Evaluator:
+    """Evaluates an agent without noise, on the seeds of dmprl's own evaluations."""
+
+    def __init__(self, env, settings):
+        self.env = env
+        self.episodes = settings["episodes"]
+        self.first_seed = settings["first_seed"]
+        self.by_success = settings["by_success"]
+        self.seconds = 0.0
+
+    def value(self, agent):
+        """Returns the mean return or the success rate, or None if no success is reported."""
+        start = time.monotonic()
+        values = [self.episode(agent, self.first_seed + index) for index in range(self.episodes)]
+        self.seconds += time.monotonic() - start
+        return None if None in values else float(sum(values) / len(values))
+
+    def episode(self, agent, seed):
+        """Runs one episode."""
+        observation, _ = self.env.reset(seed=seed)
+        total, ended, success = 0.0, False, None
+        while not ended:
+            action, _ = agent.predict(observation, deterministic=True)
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            total += float(reward)
+            ended = terminated or truncated
+            success = info.get("is_success", success)
+        if not self.by_success:
+            return total
+        return None if success is None else float(success)
+
+
+def make(kind, settings):
+    """Returns the agent, and the environment for its evaluations."""
+    module, name = AGENTS[kind]
+    agents = importlib.import_module(module)
+    import numpy as np
+
+    from dmprl import bench_peers
+
+    plan = {
+        "task": {"id": settings["task"]},
+        "options": settings["options"],
+        "spec": {"episode_steps": 0},
+    }
+    env, evaluated = bench_peers.gymnasium_env(plan), bench_peers.gymnasium_env(plan)
+    arguments = {"learning_starts": settings["learning_starts"], "seed": settings["seed"]}
+    if name == "TD3":
+        from stable_baselines3.common.noise import NormalActionNoise
+
+        size = env.action_space.shape
+        arguments["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, NOISE))
+    agent = getattr(agents, name)("MlpPolicy", env, **arguments)
+    return agent, evaluated, f"{module} {agents.__version__}"
+
+
+def train(agent, evaluator, settings, send):
+    """Trains until the target or a limit."""
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    interval, seconds_max = settings["evaluation_interval"], settings["seconds_max"]
+    start_s = time.monotonic() - STARTED
+
+    class Evaluations(BaseCallback):
+        value = None
+
+        def _on_step(self):
+            if self.num_timesteps % interval == 0:
+                self.value = evaluator.value(agent)
+                self.send(ended=False)
+                if self.value is not None and self.value >= settings["target"]:
+                    return False
+            return time.monotonic() - STARTED < seconds_max
+
+        def send(self, *, ended):
+            send(
+                {
+                    "ended": ended,
+                    "env_steps": self.num_timesteps,
+                    "value": self.value,
+                    "start_s": start_s,
+                    "evaluation_s": evaluator.seconds,
+                }
+            )
+
+    evaluations = Evaluations()
+    agent.learn(settings["steps"], callback=evaluations)
+    evaluations.send(ended=True)
+
+
+def end_with_input():
+    """Ends this process when the program that started it has ended."""
+    for _ in sys.stdin:
+        pass
+    os._exit(1)
+
+
+def main():
+    """Speaks the protocol of the module's first lines."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("kind", choices=AGENTS)
+    parser.add_argument("--settings", type=Path, required=True)
+    parser.add_argument("--package", required=True, help="folder with the package dmprl")
+    arguments = parser.parse_args()
+    # Ctrl-C reaches the whole process group; the program that reads our lines decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Output of a library must not become a line of the protocol.
+    lines = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    threading.Thread(target=end_with_input, daemon=True).start()
+    settings = json.loads(arguments.settings.read_text())
+    sys.path += [arguments.package, *settings["python_path"]]
+
+    def send(line):
+        print(json.dumps(line), file=lines)
+
+    try:
+        agent, env, about = make(arguments.kind, settings)
+    except ImportError as error:
+        why = f"{sys.executable} cannot import {error.name} ({error}); name an interpreter that has"
+        send({"absent": f"{why} it with --peer-python"})
+        return
+    except Exception as error:  # such as an environment that the library does not take
+        send({"absent": f"{type(error).__name__}: {error}"})
+        return
+    send({"ready": about})
+    train(agent, Evaluator(env, settings), settings, send)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+//! `dmprl bench peers` with real trainings, and a script in place of the other libraries.
+
+use std::os::unix::fs::PermissionsExt;
+use std::process::Command;
+
+use dmprl_tests::program::{Running, Workplace, executable};
+
+/// Answers as `tests/peers/agent_peer.py` does.
+const PEER: &str = r#"#!/bin/sh
+echo '{"ready": "a stand-in"}'
+echo '{"ended": false, "env_steps": 50, "value": -2e9, "start_s": 0.5, "evaluation_s": 0.1}'
+echo '{"ended": true, "env_steps": 100, "value": -3.0, "start_s": 0.5, "evaluation_s": 0.2}'
+"#;
+
+fn bench(place: &Workplace, peer_python: &str, more: &[&str]) -> Running {
+    let temporary = place.path("tmp");
+    std::fs::create_dir(&temporary).unwrap();
+    let mut command = Command::new(executable());
+    command.args(["bench", "peers", "--task", "Pendulum-v1", "--peer-python", peer_python]);
+    command.args(["--workers", "1", "--set", "policy.hidden=[16]"]);
+    command.args(["--set", "evaluation.interval_steps=500", "--set", "evaluation.episodes=2"]);
+    command.args(more).env("TMPDIR", temporary);
+    place.start_command(command)
+}
+
+#[test]
+fn each_seed_is_trained_until_the_target_by_all() {
+    let place = Workplace::new();
+    let python = place.path("python");
+    std::fs::write(&python, PEER).unwrap();
+    std::fs::set_permissions(&python, PermissionsExt::from_mode(0o700)).unwrap();
+    let target = ["--until-return", "-1e6", "--seeds", "2", "--peer", "sbx-sac", "--json"];
+    let finished = bench(&place, &python, &target).wait().with_status(0);
+    let json = finished.json();
+    for (name, steps) in [("ours", 500), ("sbx-sac", 100)] {
+        let candidate = &json["candidates"][name];
+        assert_eq!(candidate["reached"], 2, "{json}");
+        assert!(candidate["median_s"].as_f64() > Some(0.0), "{json}");
+        for training in candidate["trainings"].as_array().unwrap() {
+            assert!(training["env_steps"].as_u64() >= Some(steps), "{json}");
+            assert!(training["start_s"].as_f64() > Some(0.0), "{json}");
+        }
+    }
+    assert_eq!(json["target"]["value"], -1e6, "{json}");
+    assert!(json["candidates"]["sbx-sac"]["ratio"].as_f64() < Some(1.0), "{json}");
+    place.assert_no_process();
+    assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
+}
+
+#[test]
+fn a_missing_library_and_a_missed_target_are_reported() {
+    let place = Workplace::new();
+    let python = dmprl_tests::venv().executable.display().to_string();
+    let limits = ["--until-return", "1e6", "--seeds", "1", "--steps", "1000"];
+    let finished = bench(&place, &python, &limits).wait().with_status(0);
+    let row = |name: &str| {
+        let mut rows = finished.printed.lines().map(str::trim_start);
+        rows.find(|row| row.starts_with(name)).unwrap_or_else(|| panic!("{}", finished.printed))
+    };
+    assert!(row("ours").contains("0/1") && row("ours").contains("unknown"));
+    assert!(row("sb3-td3").contains("absent: ") && row("sb3-td3").contains("--peer-python"));
+}
