@@ -1,9 +1,10 @@
 """The peer of ``dmprl bench learner``: the same update in PyTorch or JAX.
 
-``python learner_peer.py torch|jax --settings FILE --threads N`` writes one JSON object a line. The
-first is ``{"ready": "description"}``, or ``{"absent": "why"}`` if it cannot; then each line
-``run SECONDS`` on standard input is answered by ``{"updates": …, "seconds": …, "cpu_s": …}``. It
-ends with its input, so the death of the program that started it ends it too.
+``python learner_peer.py torch|torch-compile|jax --settings FILE --threads N`` writes one JSON
+object a line. The first is ``{"ready": "description"}``, or ``{"absent": "why"}`` if it cannot;
+then each line ``run SECONDS`` on standard input is answered by
+``{"updates": …, "seconds": …, "cpu_s": …}``. It ends with its input, so the death of the program
+that started it ends it too.
 
 The networks, their inputs and the batch have the sizes of dmprl's own; batches lie ready in memory,
 where dmprl samples them from a replay.
@@ -24,7 +25,11 @@ sys.path.append(str(Path(__file__).parents[1] / "golden" / "update"))
 SETTLE_S = (
     0.1  # run before the clock starts: caches and clock frequency are then those of long runs
 )
-MODULES = {"torch": "torch_update", "jax": "jax_update"}
+MAKERS = {
+    "torch": ("torch_update", "make"),
+    "torch-compile": ("torch_update", "make_compiled"),
+    "jax": ("jax_update", "make"),
+}
 
 
 def confine(threads):
@@ -56,7 +61,7 @@ def run_for(update, seconds):
 def main():
     """Speaks the protocol of the module's first lines."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("kind", choices=MODULES)
+    parser.add_argument("kind", choices=MAKERS)
     parser.add_argument("--settings", type=Path, required=True)
     parser.add_argument("--threads", type=int, required=True)
     arguments = parser.parse_args()
@@ -69,9 +74,10 @@ def main():
     try:
         from settings import Settings
 
-        module = importlib.import_module(MODULES[arguments.kind])
+        module, maker = MAKERS[arguments.kind]
         settings = Settings.from_dict(json.loads(arguments.settings.read_text()))
-        update, about = module.make(settings, arguments.threads)
+        make = getattr(importlib.import_module(module), maker)
+        update, about = make(settings, arguments.threads)
     except ImportError as error:
         why = f"{sys.executable} cannot import {error.name} ({error}); name an interpreter that has"
         print(json.dumps({"absent": f"{why} it with --peer-python"}), file=lines)

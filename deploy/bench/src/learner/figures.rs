@@ -134,8 +134,9 @@ impl Figures {
         let mut object = Map::new();
         for kind in PeerKind::ALL {
             let name = kind.name();
-            object.insert(format!("peer_{name}_ms"), self.ms(name).into());
-            object.insert(format!("peer_{name}_to_ours"), self.ratio_to_ours(name).into());
+            let key = name.replace('-', "_");
+            object.insert(format!("peer_{key}_ms"), self.ms(name).into());
+            object.insert(format!("peer_{key}_to_ours"), self.ratio_to_ours(name).into());
         }
         let each = |of: &dyn Fn(&str) -> Value| -> Map<String, Value> {
             self.rounds.iter().map(|(name, _)| ((*name).to_owned(), of(name))).collect()

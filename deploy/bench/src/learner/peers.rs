@@ -27,18 +27,21 @@ const MEASURE_SLACK: Duration = Duration::from_secs(120);
 pub enum PeerKind {
     /// PyTorch, eager.
     Torch,
+    /// PyTorch, compiled.
+    TorchCompile,
     /// JAX, compiled.
     Jax,
 }
 
 impl PeerKind {
     /// All peers, in the order of the report.
-    pub(super) const ALL: [Self; 2] = [Self::Torch, Self::Jax];
+    pub(super) const ALL: [Self; 3] = [Self::Torch, Self::TorchCompile, Self::Jax];
 
     /// Name of the peer in the script.
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Torch => "torch",
+            Self::TorchCompile => "torch-compile",
             Self::Jax => "jax",
         }
     }

@@ -22,9 +22,10 @@ In every round each of these runs once for --seconds while the others sleep; the
   floor, ours     only its matrix products, with our kernels; several threads share the rows of
                   the batch
   floor, library  the same with the gemm crate; floor_ms is the faster of the two
-  torch, jax      the same update in eager PyTorch, or compiled by JAX, on as many cores, with
-                  prepared batches (--peer; tests/peers/learner_peer.py). With a peer, no actor
-                  has a penalty on changes of actions (algorithm.action_rate_penalty = 0)
+  torch, torch-compile, jax
+                  the same update in eager PyTorch, or compiled by PyTorch or JAX, on as many
+                  cores, with prepared batches (--peer; tests/peers/learner_peer.py). With a peer,
+                  no actor has a penalty on changes of actions (algorithm.action_rate_penalty = 0)
 Sampling and optimiser are also measured alone, as shares of the time. peak_memory_mb is the
 learner's (VmHWM), including its replay. Unavailable figures are null or `absent`, with the reason.
 Ctrl-C stops the benchmark and leaves nothing behind.
