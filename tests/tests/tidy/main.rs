@@ -19,7 +19,8 @@ const FUNCTION_LINES_MAX: usize = 70;
 const COLUMNS_MAX: usize = 100;
 const STAGES: u32 = 8;
 /// Folders that are built, downloaded or written by runs.
-const FOREIGN_FOLDERS: [&str; 5] = ["target", "runs", "__pycache__", ".git", ".venv"];
+const FOREIGN_FOLDERS: [&str; 6] =
+    ["target", "runs", "__pycache__", ".git", ".venv", ".venv-peers"];
 /// Start of the names of environments that were replaced.
 const OLD_ENVIRONMENT: &str = ".venv.old-";
 const MEMBERS: [&str; 18] = [
