@@ -34,7 +34,8 @@ pub struct TimeLimits {
 impl Default for TimeLimits {
     fn default() -> Self {
         Self {
-            ready: Duration::from_secs(60),
+            // Imports took a minute on a machine with ten runnable processes for each core.
+            ready: Duration::from_secs(300),
             cloning_update: Duration::from_millis(200),
             stop: Duration::from_secs(9),
             drain: Duration::from_secs(60),
