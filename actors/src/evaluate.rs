@@ -10,6 +10,7 @@ use crate::faults::Faults;
 use crate::policy_runner::PolicyRunner;
 use crate::python_env::{PythonEnvironments, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 use crate::rollout::RolloutError;
+use crate::trace::Trace;
 
 /// Steps after which an episode of an environment without a time limit is cut off.
 const EPISODE_STEPS_MAX: u32 = 10_000;
@@ -66,15 +67,6 @@ pub struct Evaluator {
     trace: Option<Trace>,
     /// Called after each segment with the number of steps of the traced episode.
     on_steps: Box<dyn FnMut(usize)>,
-}
-
-/// Actions and rewards of an episode of T steps.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Trace {
-    /// Actions u of the policy in [-1, 1], (T, A).
-    pub u: Vec<f32>,
-    /// Rewards, (T,).
-    pub rewards: Vec<f64>,
 }
 
 /// Sums of episodes that run in parallel, one per environment.
@@ -282,8 +274,7 @@ impl Evaluator {
         wave.returns[env] += rewards.iter().sum::<f64>();
         let u = &self.runner.u[env * k_max * dims..][..steps * dims];
         if let Some(trace) = &mut self.trace {
-            trace.u.extend(u);
-            trace.rewards.extend(rewards);
+            trace.add_segment(&self.environments, &self.runner);
             (self.on_steps)(trace.rewards.len());
         }
         wave.actions[env] += u.len() as u64;

@@ -33,6 +33,8 @@ pub mod recording;
 #[cfg(feature = "python")]
 pub mod rollout;
 #[cfg(feature = "python")]
+pub mod trace;
+#[cfg(feature = "python")]
 pub mod watchdog;
 #[cfg(feature = "python")]
 pub mod worker;

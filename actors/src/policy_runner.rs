@@ -105,6 +105,12 @@ impl PolicyRunner {
         &self.actions
     }
 
+    /// Returns the result of the last call of [`Self::actions`].
+    #[must_use]
+    pub fn last_actions(&self) -> &[f64] {
+        &self.actions
+    }
+
     /// Advances `state`, (y, yd) of environment `env`, from after step `k` - 1 of the segment to
     /// after step `k`. Step 0 is the start of the segment. Does nothing if the policy has no state.
     pub fn advance_state(&self, env: usize, k: usize, state: &mut [f32]) {

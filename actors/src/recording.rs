@@ -6,9 +6,10 @@ use std::sync::atomic::AtomicBool;
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::policy::Policy;
 
-use crate::evaluate::{Episodes, Evaluator, Trace};
+use crate::evaluate::{Episodes, Evaluator};
 use crate::python_env::{Joints, PythonEnvironments, StepRecording};
 use crate::rollout::RolloutError;
+use crate::trace::Trace;
 
 /// One episode of T steps.
 #[derive(Debug, Clone, PartialEq)]
@@ -19,7 +20,7 @@ pub struct EpisodeRecord {
     pub return_: f64,
     /// Success at the last step; `None` if the task does not report success.
     pub success: Option<bool>,
-    /// Actions and rewards.
+    /// Steps and segments.
     pub trace: Trace,
     /// Joints, and success after each step.
     pub recording: StepRecording,

@@ -30,6 +30,8 @@ pub struct ObservationPlan<'a> {
     pub output: PathBuf,
     /// Folder for frames; `None` records no frames.
     pub pictures: Option<PathBuf>,
+    /// Whether to write observations, commands and segments too.
+    pub details: bool,
 }
 
 impl ObservationPlan<'_> {
@@ -46,6 +48,9 @@ impl ObservationPlan<'_> {
         command.arg("--output").arg(&self.output);
         if let Some(pictures) = &self.pictures {
             command.arg("--pictures").arg(pictures);
+        }
+        if self.details {
+            command.arg("--details");
         }
         if let Some(venv) = &self.venv {
             command.arg("--venv").arg(venv);

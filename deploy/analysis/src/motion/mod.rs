@@ -15,4 +15,6 @@ mod tests;
 
 pub use file::{Motion, read, read_any};
 pub use measure::{RecordedPolicy, measure};
-pub use recorded::{Joint, JointKind, RecordedEpisode, RecordingReader, Robot};
+pub use recorded::{
+    EpisodeDetails, Joint, JointKind, RecordedEpisode, RecordedSegment, RecordingReader, Robot,
+};

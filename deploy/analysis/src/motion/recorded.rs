@@ -5,6 +5,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
+use dmprl_shared::policy::Primitives;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -84,6 +85,44 @@ pub struct RecordedEpisode {
     /// Number of steps done before each frame.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub frame_steps: Vec<usize>,
+    /// Data for a log of the episode, if it was requested.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub details: Option<EpisodeDetails>,
+}
+
+/// Observations, commands and segments of an episode of T steps.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EpisodeDetails {
+    /// Name of each entry of an observation, (O,); empty if they have no names.
+    pub observation_names: Vec<String>,
+    /// Observations before the first step and after each, (T+1, O).
+    pub observations: Vec<Vec<f64>>,
+    /// Actions in the environment's units, (T, A).
+    pub commands: Vec<Vec<f64>>,
+    /// Segments in order.
+    pub segments: Vec<RecordedSegment>,
+}
+
+impl EpisodeDetails {
+    /// Whether these are the details of an episode of `steps` steps.
+    fn has_steps(&self, steps: usize) -> bool {
+        self.observations.len() == steps + 1
+            && self.commands.len() == steps
+            && self.segments.iter().map(|segment| segment.steps).sum::<usize>() == steps
+    }
+}
+
+/// A segment: one decision of the policy.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordedSegment {
+    /// Number of steps of the episode before it.
+    pub first_step: usize,
+    /// Number of its steps.
+    pub steps: usize,
+    /// Primitives of a policy that has them.
+    pub primitives: Option<Primitives>,
 }
 
 /// Reads a recording one episode at a time.
@@ -122,7 +161,8 @@ impl RecordingReader {
                 && episode.frames.len() == episode.frame_steps.len()
                 && episode.frame_steps.iter().all(|&step| step <= steps)
                 && fits(&episode.joint_positions)
-                && fits(&episode.joint_velocities),
+                && fits(&episode.joint_velocities)
+                && episode.details.as_ref().is_none_or(|details| details.has_steps(steps)),
             "{}: the episode of seed {} is inconsistent: {steps} rewards, {} actions, {} \
              positions, {} velocities of {joints} joints",
             self.lines.name,

@@ -36,6 +36,7 @@ fn write_recording(folder: &Path, robot: &Robot, lengths: &[usize]) -> PathBuf {
             success_by_step: Vec::new(),
             frames: Vec::new(),
             frame_steps: Vec::new(),
+            details: None,
         };
         lines.push(serde_json::to_string(&episode).unwrap());
     }

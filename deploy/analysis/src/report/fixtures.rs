@@ -111,6 +111,7 @@ pub(super) fn motion_of(jerk: f64, sparc: f64) -> Motion {
             success_by_step: Vec::new(),
             frames: Vec::new(),
             frame_steps: Vec::new(),
+            details: None,
         },
     }
 }

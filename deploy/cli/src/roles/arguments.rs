@@ -205,6 +205,9 @@ pub struct ObserverArgs {
     /// Also draw frames into this folder.
     #[arg(long, value_name = "DIR")]
     pub pictures: Option<PathBuf>,
+    /// Also write observations, commands and segments.
+    #[arg(long)]
+    pub details: bool,
     /// Python virtual environment.
     #[arg(long, value_name = "DIR")]
     pub venv: Option<PathBuf>,

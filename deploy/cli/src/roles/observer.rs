@@ -10,10 +10,14 @@ use anyhow::Context;
 use dmprl_actors::environments;
 use dmprl_actors::python_env::{self, PythonEnvironments, SUCCESS_NOT_REPORTED, SUCCESS_YES};
 use dmprl_actors::recording::{EpisodeRecord, Recorder};
-use dmprl_analysis::motion::{Joint, JointKind, RecordedEpisode, Robot};
+use dmprl_actors::trace::{Trace, TracedSegment};
+use dmprl_analysis::motion::{
+    EpisodeDetails, Joint, JointKind, RecordedEpisode, RecordedSegment, Robot,
+};
 use dmprl_control::Report;
 use dmprl_run::Setup;
 use dmprl_shared::policy_file::{self, Match};
+use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::supervision::Supervisor;
 use serde::Serialize;
 
@@ -46,15 +50,16 @@ pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
         .with_context(|| format!("cannot write {}", args.output.display()))?;
     let mut lines = BufWriter::new(file);
     append(&mut lines, &robot(&recorder, spec.control_dt_s))?;
-    let dims = spec.action_len;
-    control.send(&Report::EnvironmentReady { spec })?;
+    control.send(&Report::EnvironmentReady { spec: spec.clone() })?;
     let stop = control.stop_flag();
     for index in 0..args.episodes {
         let seed = args.first_seed + index;
         let record = recorder.record(&snapshot.values, seed, stop);
         environments::report_failures(&recorder.take_failures(), control);
         let Some(record) = record? else { return Ok(()) };
-        append(&mut lines, &episode(record, dims))?;
+        let details = args.details.then(|| details(&record.trace, &spec));
+        let episode = RecordedEpisode { details, ..episode(record, spec.action_len) };
+        append(&mut lines, &episode)?;
         done.store(index + 1, Ordering::Relaxed);
         control.send(&Report::Observed { episodes: index + 1, steps: 0 })?;
     }
@@ -95,5 +100,21 @@ fn episode(record: EpisodeRecord, dims: usize) -> RecordedEpisode {
         success_by_step: record.recording.success.iter().map(success).collect(),
         frames: record.recording.frames.into_iter().map(PathBuf::from).collect(),
         frame_steps: record.recording.frame_steps,
+        details: None,
     }
+}
+
+fn details(trace: &Trace, spec: &EnvSpec) -> EpisodeDetails {
+    let rows = |values: &[f64], len| values.chunks_exact(len).map(<[f64]>::to_vec).collect();
+    EpisodeDetails {
+        observation_names: spec.observation_names.clone(),
+        observations: rows(&trace.observations, spec.observation_len),
+        commands: rows(&trace.actions, spec.action_len),
+        segments: trace.segments.iter().map(segment).collect(),
+    }
+}
+
+fn segment(traced: &TracedSegment) -> RecordedSegment {
+    let TracedSegment { first_step, steps, primitives } = traced.clone();
+    RecordedSegment { first_step, steps, primitives }
 }

@@ -31,6 +31,7 @@ pub fn measure_motion(run: &RunDirectory, observer: &Observer) -> anyhow::Result
         episodes: settings.episodes as u64,
         output: output.clone(),
         pictures: None,
+        details: false,
     };
     if launch::observe(plan, &|_, _| ())? == Outcome::Interrupted {
         return Ok(None);

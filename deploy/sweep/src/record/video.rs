@@ -154,6 +154,7 @@ fn observe(
         episodes: plan.episodes,
         output: output.clone(),
         pictures: Some(pictures),
+        details: false,
     };
     if launch::observe(observation, &on_steps)? == Outcome::Interrupted {
         return Ok(None);

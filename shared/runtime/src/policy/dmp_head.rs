@@ -4,6 +4,8 @@
 //! g = goal_range t, w = weight_range omega² t, and rho = (1, 0, 0, 0) + rho_range t. With
 //! `rho = "free"`, rho = (1, 0, 0, 0) + output. Other controllers than `inverse` have no rho.
 
+use serde::{Deserialize, Serialize};
+
 use super::start::StartState;
 use super::{PolicyDescription, PolicyError, tanh};
 use crate::config::{Controller, RhoKind};
@@ -27,6 +29,7 @@ pub struct DmpHead {
     position_scale: f32,
     rho: RhoKind,
     rho_range: f32,
+    weight_scale: f32,
     omega: f32,
 }
 
@@ -48,6 +51,20 @@ struct Scratch {
     means_gradient: Vec<f32>,
     samples_gradient: Vec<f32>,
     inputs_gradient: Vec<f32>,
+}
+
+/// The primitives of one row: A action dimensions, N basis functions.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Primitives {
+    /// Positions y0 from which the segment starts, (A,).
+    pub start: Vec<f32>,
+    /// Goals g, (A,).
+    pub goal: Vec<f32>,
+    /// Weights w \[u/s^2\], (A, N).
+    pub weights: Vec<Vec<f32>>,
+    /// Positions y after each step, (K, A).
+    pub positions: Vec<Vec<f32>>,
 }
 
 /// Gradient that the head's backward pass starts from.
@@ -80,6 +97,7 @@ impl DmpHead {
             position_scale: policy.position_scale as f32,
             rho: policy.rho,
             rho_range: policy.rho_range as f32,
+            weight_scale: weight_scale as f32,
             omega: dmp.omega() as f32,
         })
     }
@@ -204,6 +222,22 @@ impl DmpHead {
                 0 => (inputs[0], inputs[1]),
                 _ => (samples[k - 1], samples[self.steps + k - 1] * self.omega),
             };
+        }
+    }
+
+    /// Returns the primitives of row `row`, as the last segment used them.
+    #[must_use]
+    pub fn primitives(&self, work: &DmpWorkspace, row: usize) -> Primitives {
+        let cells = row * self.dims..(row + 1) * self.dims;
+        let inputs = |cell: usize| &work.inputs[cell * self.inputs_len()..][..self.inputs_len()];
+        let weights = |cell| inputs(cell)[3..].iter().map(|w| self.weight_scale * w).collect();
+        let position = |cell: usize, k: usize| work.samples[cell * 3 * self.steps + k];
+        let positions = |k| cells.clone().map(|cell| position(cell, k)).collect();
+        Primitives {
+            start: cells.clone().map(|cell| inputs(cell)[0]).collect(),
+            goal: cells.clone().map(|cell| inputs(cell)[2]).collect(),
+            weights: cells.clone().map(weights).collect(),
+            positions: (0..self.steps).map(positions).collect(),
         }
     }
 

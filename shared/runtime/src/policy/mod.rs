@@ -33,7 +33,7 @@ use thiserror::Error;
 pub use action_scaling::ActionScaling;
 pub use command_state::CommandState;
 pub use description::PolicyDescription;
-pub use dmp_head::{DmpHead, DmpWorkspace, HeadGradient};
+pub use dmp_head::{DmpHead, DmpWorkspace, HeadGradient, Primitives};
 pub use hold::{Hold, HoldError};
 pub use learned_std::LearnedStd;
 pub use matrix::{Keep, Matrix, product};
