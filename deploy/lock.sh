@@ -49,7 +49,7 @@ project=envs_py/pyproject.toml
     requirements $project build-system requires
 } | lock envs_py/locks/base.txt
 # The optional parts that dmprl installs by itself.
-for extra in demos hub search video; do
+for extra in demos hub rerun search video; do
     requirements $project project optional-dependencies $extra |
         lock envs_py/locks/$extra.txt --constraint envs_py/locks/base.txt
 done

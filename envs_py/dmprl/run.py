@@ -92,6 +92,7 @@ class Run:
         :param quiet: suppresses progress.
         :param flags: flags of ``dmprl record``: ``episodes=3``, ``seed=7``, ``policy="latest"``,
             ``compare=...`` another run, ``output=...`` a folder instead of ``videos`` in the run,
+            ``rerun=True`` to write a Rerun log (``.rrd``) beside the video,
             ``trust_code=True`` to import the modules of a run that you did not make.
         :raises dmprl.ProgramError: if it cannot be made; the message gives the reason.
         """

@@ -11,6 +11,7 @@ from pip._vendor.packaging.utils import canonicalize_name
 PACKAGE = Path(__file__).parents[1]
 PYTHONS = ["3.11", "3.12", "3.13", "3.14"]
 MACHINES = ["x86_64", "aarch64"]
+EXTRAS = ["demos", "hub", "rerun", "search", "video"]
 REMEDY = "run deploy/lock.sh"
 
 
@@ -75,12 +76,19 @@ class LockTest(unittest.TestCase):
 
     def test_parts_that_the_program_installs_are_locked_and_go_with_the_base(self):
         extras = self.manifest["project"]["optional-dependencies"]
-        for extra in ["demos", "hub", "search", "video"]:
+        for extra in EXTRAS:
             self.check(extra, extras[extra])
             for where in self.places():
                 base = versions("base", where)
                 for package, version in versions(extra, where).items():
                     self.assertEqual(base.get(package, version), version, package)
+
+    def test_parts_can_be_installed_after_each_other(self):
+        for one, other in itertools.combinations(EXTRAS, 2):
+            for where in self.places():
+                found = versions(one, where)
+                for package, version in versions(other, where).items():
+                    self.assertEqual(found.get(package, version), version, f"{one}, {other}")
 
     def test_locks_name_no_host(self):
         for path in (PACKAGE / "locks").iterdir():

@@ -1,6 +1,6 @@
 //! The Python package with its optional extras: readers of demonstrations, panda-gym,
-//! Gymnasium-Robotics, huggingface_hub, Optuna, an ONNX runtime, TensorBoard's reader, experiment
-//! trackers and mypy.
+//! Gymnasium-Robotics, huggingface_hub, Optuna, an ONNX runtime, Rerun, TensorBoard's reader,
+//! experiment trackers and mypy.
 //!
 //! They have their own virtual environment, made once: PyBullet is large, most users need none of
 //! them, and it has no build for some versions of Python. Tests of packages that cannot be
@@ -16,14 +16,20 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use dmprl_actors::python_env::LINKED_PYTHON;
-use dmprl_tests::program::Workplace;
+use dmprl_run::failure::Outcome;
+use dmprl_run::{PolicyChoice, RunDirectory};
+use dmprl_supervisor::{ObservationPlan, observe};
+use dmprl_tests::program::{Workplace, executable};
 use dmprl_tests::skipped::skipped;
-use dmprl_tests::{exported, project_root};
+use dmprl_tests::{exported, project_root, venv};
 
 /// Extras of `envs_py/pyproject.toml`, from all to one, with the tests that need them.
 const ATTEMPTS: [(&str, &str); 2] = [
     ("test", "test_*.py"),
-    ("demos,frames,hub,onnx,robotics,search,tensorboard,trackers,types", "test_[dfhorst]*.py"),
+    (
+        "demos,frames,hub,onnx,rerun,robotics,search,tensorboard,trackers,types",
+        "test_[dfhorst]*.py",
+    ),
 ];
 /// PyBullet has builds only for this version.
 const REMEDY: &str = "PYO3_PYTHON=python3.11 on x86-64, with a network";
@@ -89,9 +95,11 @@ fn environment_with(extra: &str) -> Result<PathBuf, String> {
 fn run_tests(python: &Path, tests: &str) {
     let (exported, place) = (tempfile::tempdir().unwrap(), Workplace::new());
     exported::write(exported.path());
+    let run = trained(&place);
     let output = Command::new(python)
         .env("TEST_EXPORTED", exported.path())
-        .env("TEST_RUN", trained(&place))
+        .env("TEST_RUN", &run)
+        .env("TEST_OBSERVED", observed(&place, &run))
         .args(["-m", "unittest", "discover", "--start-directory", "envs_py/tests_extras"])
         .args(["--pattern", tests])
         .current_dir(project_root())
@@ -119,6 +127,25 @@ fn trained(place: &Workplace) -> String {
     place.run(&arguments).with_status(0);
     place.run(&["resume", &run, "--steps", "2500"]).with_status(0);
     run
+}
+
+/// The file of an observer of the run's latest policy: two episodes with details, from seed 1000.
+fn observed(place: &Workplace, run: &str) -> String {
+    let run = RunDirectory::open(Path::new(run)).unwrap();
+    let output = place.path("episodes.jsonl");
+    let plan = ObservationPlan {
+        program: executable().to_path_buf(),
+        run: &run,
+        venv: Some(venv().venv.clone()),
+        policy_version: run.choose_policy(PolicyChoice::Latest).unwrap().version,
+        first_seed: 1_000,
+        episodes: 2,
+        output: PathBuf::from(&output),
+        pictures: None,
+        details: true,
+    };
+    assert_eq!(observe(plan, &|_, _| ()).unwrap(), Outcome::Done);
+    output
 }
 
 fn report(output: &Output) -> String {

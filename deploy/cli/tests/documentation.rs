@@ -16,7 +16,8 @@ const LIMITS: Limits = Limits { cores: 2 };
 /// Commands that call the program in the documents.
 const CALLS: [&str; 3] = ["cargo run --release -- ", "target/release/dmprl ", "dmprl "];
 /// Flags of other programs: cargo's, TensorBoard's, docker's, and those of Slurm's sbatch.
-const FOREIGN: [&str; 17] = [
+const FOREIGN: [&str; 18] = [
+    "--bind",
     "--bench",
     "--package",
     "--features",

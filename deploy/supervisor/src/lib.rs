@@ -56,7 +56,7 @@ mod whole_run;
 pub use answer::answer;
 pub use domain::{Place, create as create_domain, token as domain_token};
 pub use evaluate::{EvaluationPlan, evaluate};
-pub use film::film;
+pub use film::{FilmProgram, film};
 pub use host::{HostPlan, host};
 pub use launcher::{Launcher, Upstream};
 pub use limits::TimeLimits;

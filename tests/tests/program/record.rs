@@ -1,4 +1,4 @@
-//! `dmprl record`: videos of real runs, checked with the library that made them.
+//! `dmprl record`: videos and logs of real runs, checked with the libraries that made them.
 
 use std::fs;
 use std::path::Path;
@@ -22,6 +22,17 @@ differing = sum(a.tobytes() != b.tobytes() for a, b in zip(frames, frames[1:]))
 gif = Image.open(sys.argv[2])
 strip = Image.open(sys.argv[3])
 print(len(frames), *frames[0].size, differing, gif.n_frames, *strip.size)
+";
+
+/// Prints the rows of each entity of a Rerun log that changes over time.
+const READ_LOG: &str = "
+import collections, json, sys
+from rerun.chunk import RrdReader
+rows = collections.Counter()
+for chunk in RrdReader(sys.argv[1]).stream().to_chunks():
+    if not chunk.is_static:
+        rows[chunk.entity_path] += chunk.num_rows
+print(json.dumps(rows))
 ";
 
 fn python(arguments: &[&str]) -> std::process::Output {
@@ -79,6 +90,35 @@ fn two_runs_side_by_side_show_the_episodes_that_eval_runs() {
     let expected = [102, 968, 568, 101, 51, 6 * 240 + 5 * 8, 4 * (240 + 2 * 44)];
     assert_eq!(numbers(&looked.stdout), expected);
     assert_eq!(fs::read_dir(format!("{run}/videos")).unwrap().count(), 3, "nothing else is left");
+    place.assert_no_process();
+}
+
+#[test]
+fn a_rerun_log_of_two_runs_is_written_beside_the_video() {
+    let place = Workplace::new();
+    let (run, other) = (place.path("run"), place.path("other"));
+    place.run(&train("reacher", &run, &["--steps", "1000"])).with_status(0);
+    place.run(&train("reacher", &other, &["--steps", "1000", "--policy", "mlp"])).with_status(0);
+    if !can_draw() {
+        return;
+    }
+    let arguments = ["record", &run, "--compare", &other, "--rerun", "--json"];
+    let made = place.run(&arguments).with_status(0).json();
+    let log = made["rrd"].as_str().unwrap();
+    assert_eq!(log, made["mp4"].as_str().unwrap().replace(".mp4", ".rrd"));
+    assert_eq!(fs::read_dir(format!("{run}/videos")).unwrap().count(), 4, "nothing else is left");
+    let read = python(&["-c", READ_LOG, log]);
+    assert!(read.status.success(), "{}", String::from_utf8_lossy(&read.stderr));
+    let rows: Value = serde_json::from_slice(&read.stdout).unwrap();
+    for side in ["run", "other"] {
+        for (entity, expected) in [("camera", 51), ("command/action\\[1\\]", 50), ("return", 51)] {
+            let path = format!("/{side}/episode_1000/{entity}");
+            assert_eq!(rows[&path], expected, "{path}: {rows}");
+        }
+    }
+    // Ten segments of five steps, and fifty decisions.
+    assert_eq!(rows["/run/episode_1000/segment/goal/action\\[0\\]"], 10, "{rows}");
+    assert_eq!(rows["/other/episode_1000/segment/index"], 50, "{rows}");
     place.assert_no_process();
 }
 

@@ -1,4 +1,5 @@
-//! `dmprl record`: records a policy's episodes as a video, an animation and a strip of frames.
+//! `dmprl record`: records a policy's episodes as a video, an animation, a strip of frames, and a
+//! Rerun log.
 
 use std::path::PathBuf;
 
@@ -20,9 +21,14 @@ success. Needs no display: it renders with OpenGL by EGL or OSMesa; if both are 
 names the packages. The tasks of `dmprl tasks` draw their goal; other environments are recorded as
 their render mode `rgb_array` draws them.
 
+--rerun writes a log for the viewer of rerun.io too. It has each step's observation, command, reward
+and picture, and each segment's goal, weights and planned positions. The first use installs
+rerun-sdk, a download of 170 MB, with the viewer `rerun`.
+
 EXAMPLES
   dmprl record runs/mine
   dmprl record runs/mine --policy latest --episodes 3
+  dmprl record zoo:panda-push --rerun
   dmprl record runs/td3-dmp --compare runs/td3-mlp --seed 1004
   dmprl record runs/mine --output pictures --json";
 
@@ -52,6 +58,9 @@ pub(super) struct RecordArgs {
     /// Output directory [default: videos in the run].
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
+    /// Also write a Rerun log (.rrd) of observations, commands, segments and pictures.
+    #[arg(long)]
+    rerun: bool,
     #[command(flatten)]
     trust: TrustArgs,
     /// Print one JSON object on standard output.
@@ -80,6 +89,9 @@ pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
         return Err(wrong_use(format!("--seed {first_seed} leaves no seeds for its episodes")));
     }
     let (venv, python) = prepare_python_with("video")?;
+    if args.rerun {
+        prepare_python_with("rerun")?;
+    }
     let plan = RecordPlan {
         sides,
         first_seed,
@@ -87,6 +99,7 @@ pub(super) fn run(args: &RecordArgs) -> anyhow::Result<Outcome> {
         output: args.output.clone().unwrap_or_else(|| run.path().join("videos")),
         observer: Observer { program: this_program()?, venv },
         python,
+        rerun: args.rerun,
     };
     let progress = TerminalProgress::default();
     let made = record(&plan, &progress);
@@ -139,6 +152,9 @@ fn text(recordings: &Recordings) -> String {
         [("video", &recordings.mp4), ("animation", &recordings.gif), ("frames", &recordings.strip)]
     {
         lines.push(format!("{what:<12}{}", shown(path)));
+    }
+    if let Some(path) = &recordings.rrd {
+        lines.push(format!("{:<12}{}", "rerun log", shown(path)));
     }
     lines.join("\n")
 }

@@ -194,5 +194,6 @@ fn first_episode<'r>(
         output: run.path().join("videos"),
         observer: observer.clone(),
         python: python.to_owned(),
+        rerun: false,
     })
 }

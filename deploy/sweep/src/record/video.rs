@@ -1,17 +1,18 @@
-//! Records videos of the episodes of one run, or of two side by side.
+//! Records videos and logs of the episodes of one run, or of two side by side.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use dmprl_analysis::motion::{RecordedEpisode, RecordingReader, Robot};
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::grouped;
 use dmprl_run::{ChosenPolicy, Progress, RunDirectory, safe_name};
-use dmprl_supervisor::{self as launch, ObservationPlan};
+use dmprl_supervisor::{self as launch, FilmProgram, ObservationPlan};
 use serde::Serialize;
 
-use super::film_plan::{FilmFiles, write};
+use super::film_plan::{self, FilmFiles};
 use super::observer::Observer;
+use super::rerun_plan;
 
 /// Plan of a recording.
 pub struct RecordPlan<'a> {
@@ -25,8 +26,10 @@ pub struct RecordPlan<'a> {
     pub output: PathBuf,
     /// Program and environment of the observers.
     pub observer: Observer,
-    /// Python interpreter that runs `dmprl.film`.
+    /// Python interpreter that runs `dmprl.film` and `dmprl.rerun_log`.
     pub python: PathBuf,
+    /// Whether to write a Rerun log too.
+    pub rerun: bool,
 }
 
 /// Recording of one run.
@@ -45,6 +48,9 @@ pub struct SideRecord {
     /// Recorded episodes.
     #[serde(skip)]
     pub episodes: Vec<RecordedEpisode>,
+    /// The observer's file with the episodes and their details.
+    #[serde(skip)]
+    pub(super) observed: PathBuf,
 }
 
 /// Result of a recording.
@@ -58,6 +64,9 @@ pub struct Recordings {
     pub gif: PathBuf,
     /// Path of the filmstrip.
     pub strip: PathBuf,
+    /// Path of the Rerun log, if it was requested.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rrd: Option<PathBuf>,
 }
 
 /// Records the episodes; returns `None` if the user interrupts.
@@ -95,15 +104,21 @@ pub fn record(
         };
         sides.push(side);
     }
-    progress.stage("making the video");
     let name = name(plan);
     let file = |ending: &str| temporary.path().join(format!("{name}{ending}"));
     let files = FilmFiles { mp4: file(".mp4"), gif: file(".gif"), strip: file(".png") };
-    let film = write(&sides, &files, temporary.path())?;
-    let run = plan.sides[0].0;
-    let on_frame = |done, of| progress.at(done, of);
-    if launch::film(run, &plan.python, &film, &on_frame)? == Outcome::Interrupted {
+    let film = film_plan::write(&sides, &files, temporary.path())?;
+    progress.stage("making the video");
+    if make(plan, FilmProgram::Video, &film, progress)? == Outcome::Interrupted {
         return Ok(None);
+    }
+    let rrd = plan.rerun.then(|| file(".rrd"));
+    if let Some(rrd) = &rrd {
+        let log = rerun_plan::write(&sides, rrd, temporary.path())?;
+        progress.stage("writing the Rerun log");
+        if make(plan, FilmProgram::RerunLog, &log, progress)? == Outcome::Interrupted {
+            return Ok(None);
+        }
     }
     let moved = |path: PathBuf| {
         let to = plan.output.join(path.file_name().unwrap_or_default());
@@ -113,8 +128,20 @@ pub fn record(
         mp4: moved(files.mp4)?,
         gif: moved(files.gif)?,
         strip: moved(files.strip)?,
+        rrd: rrd.map(moved).transpose()?,
         sides,
     }))
+}
+
+/// Makes the files that `described` describes.
+fn make(
+    plan: &RecordPlan<'_>,
+    program: FilmProgram,
+    described: &Path,
+    progress: &dyn Progress,
+) -> anyhow::Result<Outcome> {
+    let on_frame = |done, of| progress.at(done, of);
+    launch::film(program, plan.sides[0].0, &plan.python, described, &on_frame)
 }
 
 /// Plan of the recording of one run.
@@ -154,7 +181,7 @@ fn observe(
         episodes: plan.episodes,
         output: output.clone(),
         pictures: Some(pictures),
-        details: false,
+        details: plan.rerun,
     };
     if launch::observe(observation, &on_steps)? == Outcome::Interrupted {
         return Ok(None);
@@ -163,10 +190,12 @@ fn observe(
     let mut episodes = Vec::new();
     while let Some(episode) = recorded.next_episode()? {
         ensure!(!episode.frames.is_empty(), "the episode of seed {} has no frame", episode.seed);
-        episodes.push(episode);
+        // The log is made from the observer's file.
+        episodes.push(RecordedEpisode { details: None, ..episode });
     }
     let (run, robot) = (run.path().to_owned(), recorded.robot);
-    Ok(Some(SideRecord { run, policy_version: chosen.version, title, robot, episodes }))
+    let (policy_version, observed) = (chosen.version, output);
+    Ok(Some(SideRecord { run, policy_version, title, robot, episodes, observed }))
 }
 
 /// Returns a title for each run: its method, or the run's name if the methods are equal.
