@@ -95,7 +95,10 @@ impl Algorithm {
         };
         let device = match config.learner.device {
             config::Device::Cpu => Device::Cpu,
-            config::Device::Cuda => Device::new_cuda(0)?,
+            // The device's stream is that of the thread that uses it: the learner's, as here.
+            config::Device::Cuda => Device::new_cuda(0).map_err(|error| {
+                error.context("learner.device = \"cuda\": cannot use a GPU (see `dmprl doctor`)")
+            })?,
         };
         let replica = config.updates_by_graph().then(|| DeviceReplica::new(config, device));
         Ok(Self { shape, pool: ThreadPool::new(config.learner.threads), kind, replica })

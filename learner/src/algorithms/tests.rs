@@ -206,6 +206,33 @@ fn another_device_learns_the_same_and_hands_it_back() {
     }
 }
 
+/// Candle's CPU takes both, a GPU neither.
+#[test]
+fn a_graph_has_no_empty_tensor_and_no_product_of_rows_with_gaps() {
+    let cases = [
+        case(&[("algorithm.name", "ddpg"), ("policy.kind", "mlp")]),
+        case(&[("algorithm.name", "td3"), ("policy.kind", "chunk")]),
+        case(&[("algorithm.name", "sac")]),
+        case(&[("algorithm.name", "tqc"), ("policy.kind", "mlp")]),
+        case_with_outcomes(&[("policy.start", "carry")]),
+    ];
+    for case in cases {
+        let (shape, networks) = (case.algorithm.batch_shape(), case.algorithm.networks());
+        let graph = Graph::new(&case.config, &case.policy, shape, &Device::Cpu, &networks).unwrap();
+        graph.assert_fits_a_gpu(&case.policy, &case.batch);
+    }
+}
+
+#[cfg(not(feature = "cuda"))]
+#[test]
+fn a_gpu_that_cannot_be_used_is_an_error_that_names_the_key() {
+    let mut config = ExperimentConfig::default();
+    config.learner.device = config::Device::Cuda;
+    let policy = Policy::new(config.policy_description(&spec())).unwrap();
+    let error = Algorithm::new(&config, &policy, None).unwrap_err().to_string();
+    assert!(error.contains("learner.device = \"cuda\""), "{error}");
+}
+
 #[test]
 fn the_switch_normalises_critics_and_no_other_network() {
     for algorithm in ["ddpg", "td3", "sac"] {

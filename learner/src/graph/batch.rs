@@ -7,7 +7,7 @@ use super::Graph;
 use super::policy::DeviceStates;
 use crate::algorithms::batch::Batch;
 
-/// The tensors of a [`Batch`].
+/// The tensors of a [`Batch`]. Unused ones are `None`, because a GPU has no empty tensors.
 #[derive(Debug)]
 pub(super) struct DeviceBatch {
     /// s_t.
@@ -16,16 +16,16 @@ pub(super) struct DeviceBatch {
     pub(super) next_states: DeviceStates,
     /// Critic inputs with the batch's own actions, (B, critic inputs).
     pub(super) critic_inputs: Tensor,
-    /// Standard normal noise for the actions after the window, (B, K A), or (B, 0).
-    pub(super) next_noise: Tensor,
-    /// Standard normal noise for the actor's own actions, (B, K A), or (B, 0).
-    pub(super) noise: Tensor,
-    /// u_{t-1}, (B, A).
+    /// Standard normal noise for the actions after the window, (B, K A), for TD3, SAC and TQC.
+    pub(super) next_noise: Option<Tensor>,
+    /// Standard normal noise for the actor's own actions, (B, K A), for SAC and TQC.
+    pub(super) noise: Option<Tensor>,
+    /// u_{t-2} and u_{t-1}, (B, 2A).
     pub(super) previous_actions: Tensor,
-    /// 1 if u_{t-1} exists, else 0, (B, 1).
+    /// 1 if u_{t-2}, and u_{t-1}, exist, else 0, (B, 2).
     pub(super) has_previous: Tensor,
     /// Motion of the achieved goal, (B, K G), for the outcome model.
-    pub(super) motion: Tensor,
+    pub(super) motion: Option<Tensor>,
     rewards: Tensor,
     bootstrap: Tensor,
     target_range: [f32; 2],
@@ -41,44 +41,102 @@ impl DeviceBatch {
     }
 }
 
+/// Returns a part of a batch that the algorithm needs.
+///
+/// # Errors
+/// If the batch was sampled without it.
+pub(super) fn needed<'a>(part: &'a Option<Tensor>, name: &str) -> Result<&'a Tensor> {
+    match part {
+        Some(part) => Ok(part),
+        None => candle_core::bail!("the batch has no {name}"),
+    }
+}
+
 impl Graph {
-    /// Copies a batch to the device.
+    /// Copies a batch to the device. It is one copy, because each has a price besides its bytes.
     pub(super) fn batch(&self, policy: &Policy, batch: &Batch) -> Result<DeviceBatch> {
+        let starts = |observations: &Vec<f32>| match policy.head() {
+            Head::Dmp(head) => head.starts(observations),
+            Head::Mlp => Vec::new(),
+        };
+        let observations = [&batch.observations, &batch.next_observations];
+        let [starts, next_starts] = observations.map(starts);
+        let [distances, next_distances] = observations.map(|rows| self.goal_distances(rows));
+        let parts: [&[f32]; 14] = [
+            &batch.inputs,
+            &starts,
+            &distances,
+            &batch.next_inputs,
+            &next_starts,
+            &next_distances,
+            &batch.critic_inputs,
+            &batch.next_noise,
+            &batch.noise,
+            &batch.previous_actions,
+            &batch.has_previous,
+            &batch.motion,
+            &batch.rewards,
+            &batch.bootstrap,
+        ];
+        let block = Tensor::new(parts.concat(), &self.device)?;
+        let mut end = 0;
+        let views = parts.map(|part| {
+            end += part.len();
+            (!part.is_empty()).then(|| {
+                let view = block.narrow(0, end - part.len(), part.len())?;
+                view.reshape((self.shape.rows, ()))
+            })
+        });
+        let [inputs, starts, distances, next_inputs, next_starts, next_distances, views @ ..] =
+            views;
+        let [critic_inputs, next_noise, noise, previous_actions, has_previous, views @ ..] = views;
+        let [motion, rewards, bootstrap] = views;
         Ok(DeviceBatch {
-            states: self.states(policy, &batch.observations, &batch.inputs)?,
-            next_states: self.states(policy, &batch.next_observations, &batch.next_inputs)?,
-            critic_inputs: self.rows(&batch.critic_inputs)?,
-            next_noise: self.rows(&batch.next_noise)?,
-            noise: self.rows(&batch.noise)?,
-            previous_actions: self.rows(&batch.previous_actions)?,
-            has_previous: self.rows(&batch.has_previous)?,
-            motion: self.rows(&batch.motion)?,
-            rewards: self.rows(&batch.rewards)?,
-            bootstrap: self.rows(&batch.bootstrap)?,
+            states: self.states(inputs, starts, distances)?,
+            next_states: self.states(next_inputs, next_starts, next_distances)?,
+            critic_inputs: present(critic_inputs)?,
+            next_noise: next_noise.transpose()?,
+            noise: noise.transpose()?,
+            previous_actions: present(previous_actions)?,
+            has_previous: present(has_previous)?,
+            motion: motion.transpose()?,
+            rewards: present(rewards)?,
+            bootstrap: present(bootstrap)?,
             target_range: batch.target_range,
         })
     }
 
-    fn rows(&self, values: &[f32]) -> Result<Tensor> {
-        let rows = self.shape.rows;
-        Tensor::from_slice(values, (rows, values.len() / rows), &self.device)
-    }
-
-    fn states(
-        &self,
-        policy: &Policy,
-        observations: &[f32],
-        inputs: &[f32],
-    ) -> Result<DeviceStates> {
-        let starts = match policy.head() {
-            Head::Dmp(head) => head.starts(observations),
-            Head::Mlp => Vec::new(),
-        };
-        let rows = starts.len() / 2;
+    fn states(&self, inputs: View, starts: View, distances: View) -> Result<DeviceStates> {
         Ok(DeviceStates {
-            inputs: self.rows(inputs)?,
-            starts: Tensor::from_vec(starts, (rows, 2), &self.device)?,
-            goal_distances: self.goal_distances(observations)?,
+            inputs: present(inputs)?,
+            starts: starts.transpose()?.map(|starts| starts.reshape(((), 2))).transpose()?,
+            goal_distances: distances.transpose()?.map(|it| it.unsqueeze(1)).transpose()?,
         })
+    }
+}
+
+/// A part of a batch's block, (B, N), or `None` if it is empty.
+type View = Option<Result<Tensor>>;
+
+fn present(view: View) -> Result<Tensor> {
+    view.unwrap_or_else(|| candle_core::bail!("a part of the batch is empty"))
+}
+
+#[cfg(test)]
+impl Graph {
+    /// Fails if a batch has tensors that candle takes on a CPU, but not on a GPU: empty ones, and
+    /// inputs of products whose rows have gaps.
+    pub(crate) fn assert_fits_a_gpu(&self, policy: &Policy, batch: &Batch) {
+        let batch = self.batch(policy, batch).unwrap();
+        let DeviceBatch { states, next_states, critic_inputs, next_noise, noise, .. } = &batch;
+        let mut optional = vec![next_noise, noise, &batch.motion];
+        for states in [states, next_states] {
+            optional.extend([&states.starts, &states.goal_distances]);
+        }
+        let always = [critic_inputs, &states.inputs, &next_states.inputs, &batch.rewards];
+        for tensor in always.into_iter().chain(optional.into_iter().flatten()) {
+            assert!(tensor.elem_count() > 0 && tensor.is_contiguous(), "{:?}", tensor.layout());
+        }
+        assert!(self.model_inputs(critic_inputs).unwrap().is_contiguous());
     }
 }

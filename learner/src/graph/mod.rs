@@ -8,6 +8,7 @@
 
 mod batch;
 mod ddpg;
+mod losses;
 mod modules;
 mod network;
 mod outcome;
@@ -18,7 +19,7 @@ mod tqc;
 
 use std::fmt::Debug;
 
-use candle_core::{D, Device, Module, Result, Tensor};
+use candle_core::{D, DType, Device, Module, Result, Tensor};
 use candle_nn::VarBuilder;
 use dmprl_shared::config::{AlgorithmConfig, AlgorithmName, ExperimentConfig};
 use dmprl_shared::policy::Policy;
@@ -27,6 +28,7 @@ use crate::algorithms::batch::{Batch, BatchShape};
 use crate::algorithms::losses::Losses;
 use crate::update::network::TrainableNetwork;
 use batch::DeviceBatch;
+use losses::DeviceLosses;
 use network::DeviceNetwork;
 use policy::{DeviceStates, Means, PolicyGraph, mlp};
 
@@ -62,7 +64,7 @@ trait GraphAlgorithm: Debug + Send + Sync {
     ///
     /// # Errors
     /// If a device operation fails.
-    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, update: u64) -> Result<Losses>;
+    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, update: u64) -> Result<DeviceLosses>;
 }
 
 /// Networks with their names in a checkpoint.
@@ -86,21 +88,19 @@ enum Of {
     Target,
 }
 
-/// Losses of a critic step, as means over the batch.
-struct CriticLosses {
-    /// (Q - target)², summed over the critics.
-    critic_loss: f32,
-    /// Q of the first critic.
-    q_mean: f32,
-    /// |Q| of the first critic.
-    q_size: f64,
+/// Result of a critic step.
+struct CriticStep {
+    losses: DeviceLosses,
+    /// Mean of |Q| of the first critic over the batch, a scalar.
+    q_size: Tensor,
 }
 
-impl CriticLosses {
-    /// Returns the figures of an update.
-    fn losses(&self, actor_loss: Option<f32>) -> Losses {
-        let Self { critic_loss, q_mean, .. } = *self;
-        Losses { critic_loss, q_mean, actor_loss, ..Losses::default() }
+impl CriticStep {
+    /// Makes the result from the loss of all critics and Q of the first one, one per row.
+    fn new(critic_loss: Tensor, q: Option<Tensor>) -> Result<Self> {
+        let Some(q) = q else { candle_core::bail!("there is no critic") };
+        let losses = DeviceLosses::of_critics(critic_loss, q.mean_all()?);
+        Ok(Self { losses, q_size: q.abs()?.mean_all()? })
     }
 }
 
@@ -190,7 +190,7 @@ impl Graph {
     pub fn update(&mut self, policy: &Policy, batch: &Batch, update: u64) -> Result<Losses> {
         let mut batch = self.batch(policy, batch)?;
         self.outcome_step(&mut batch)?;
-        self.algorithm.update(self, &batch, update)
+        self.algorithm.update(self, &batch, update)?.read()
     }
 
     fn network(&self, name: &str) -> Result<&DeviceNetwork> {
@@ -252,20 +252,18 @@ impl Graph {
         batch: &DeviceBatch,
         next_values: &Tensor,
         moves_targets: bool,
-    ) -> Result<CriticLosses> {
+    ) -> Result<CriticStep> {
         let targets = batch.targets(next_values)?;
-        let (mut sum, mut q_mean, mut q_size) = (0.0, 0.0, 0.0);
-        for (index, critic) in critics.iter().enumerate() {
+        let mut sum = self.zero()?;
+        let mut first_q = None;
+        for critic in critics {
             let q = self.forward(critic, Of::Network, &batch.critic_inputs)?;
-            if index == 0 {
-                q_mean = q.mean_all()?.to_scalar()?;
-                q_size = f64::from(q.abs()?.mean_all()?.to_scalar::<f32>()?);
-            }
+            first_q.get_or_insert(q.detach());
             let loss = (q - &targets)?.sqr()?.mean_all()?;
-            sum += loss.to_scalar::<f32>()?;
+            sum = (sum + loss.detach())?;
             self.descend(critic, &loss, moves_targets)?;
         }
-        Ok(CriticLosses { critic_loss: sum, q_mean, q_size })
+        CriticStep::new(sum, first_q)
     }
 
     /// Does an actor step on -Q(s, pi(s)) of one critic, plus the penalties on changes of actions,
@@ -274,20 +272,20 @@ impl Graph {
         &mut self,
         critic: &str,
         batch: &DeviceBatch,
-        q_size: f64,
-    ) -> Result<f32> {
+        q_size: &Tensor,
+    ) -> Result<Tensor> {
         let means = self.means(Of::Network, &batch.states)?;
         let u = means.means.tanh()?;
         let inputs = self.critic_inputs(&batch.states, &means.with_end_state(&u)?)?;
         let q = self.forward(critic, Of::Frozen, &inputs)?.mean_all()?;
         let loss = (self.action_penalties(&u, batch, q_size)? - q)?;
         self.descend("actor", &loss, true)?;
-        loss.to_scalar()
+        Ok(loss)
     }
 
     /// Returns the penalties on changes of the actions u, (B, K A), on their rate and on their
     /// acceleration: sums of squares, as means over the batch and shares of |Q|.
-    fn action_penalties(&self, u: &Tensor, batch: &DeviceBatch, q_size: f64) -> Result<Tensor> {
+    fn action_penalties(&self, u: &Tensor, batch: &DeviceBatch, q_size: &Tensor) -> Result<Tensor> {
         let dims = self.shape.action_len;
         let changes_of = |x: &Tensor| {
             let len = x.dim(1)? - dims;
@@ -303,23 +301,30 @@ impl Graph {
                 }
             }
             let from = parts.len() * dims;
-            parts.push(changes.narrow(1, from, changes.dim(1)? - from)?);
-            Tensor::cat(&parts, 1)?.sqr()?.sum(1)?.mean_all()
+            if from < changes.dim(1)? {
+                parts.push(changes.narrow(1, from, changes.dim(1)? - from)?);
+            }
+            Tensor::cat(&parts, 1)?.sqr()?.sum(1)?.mean_all()?.mul(q_size)
         };
         let changes = changes_of(&Tensor::cat(&[&batch.previous_actions, u], 1)?)?;
         let AlgorithmConfig { action_rate_penalty, action_acceleration_penalty, .. } =
             self.config.algorithm;
-        let mut sum = Tensor::zeros((), u.dtype(), u.device())?;
+        let mut sum = self.zero()?;
         if action_rate_penalty > 0.0 {
             // The first change is before the decision.
             let own = changes.narrow(1, dims, changes.dim(1)? - dims)?;
-            sum = (sum + (masked(&own, &[1])? * (action_rate_penalty * q_size))?)?;
+            sum = (sum + (masked(&own, &[1])? * action_rate_penalty)?)?;
         }
         if action_acceleration_penalty > 0.0 {
             let own = changes_of(&changes)?;
-            sum = (sum + (masked(&own, &[0, 1])? * (action_acceleration_penalty * q_size))?)?;
+            sum = (sum + (masked(&own, &[0, 1])? * action_acceleration_penalty)?)?;
         }
         Ok(sum)
+    }
+
+    /// Returns the scalar 0 on the device.
+    fn zero(&self) -> Result<Tensor> {
+        Tensor::zeros((), DType::F32, &self.device)
     }
 
     /// Does one step of Adam of network `name` on `loss`. With `moves_target`, it also moves the

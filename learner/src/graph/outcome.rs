@@ -2,7 +2,7 @@
 
 use candle_core::{D, Result, Tensor};
 
-use super::batch::DeviceBatch;
+use super::batch::{DeviceBatch, needed};
 use super::policy::DeviceStates;
 use super::{Graph, Of};
 
@@ -15,14 +15,12 @@ pub(super) struct Prediction {
 }
 
 impl Graph {
-    /// Returns d_0 of observations, (B, 1, G), if there is a model.
-    pub(super) fn goal_distances(&self, observations: &[f32]) -> Result<Option<Tensor>> {
-        let Some(outcome) = self.shape.outcome else { return Ok(None) };
+    /// Returns d_0 of observations, (B, G). Empty without a model.
+    pub(super) fn goal_distances(&self, observations: &[f32]) -> Vec<f32> {
+        let Some(outcome) = self.shape.outcome else { return Vec::new() };
         let rows = observations.chunks_exact(self.shape.observation_len);
-        let starts = rows
-            .flat_map(|row| (0..outcome.goal_len).map(move |index| outcome.start(row, index)))
-            .collect();
-        Tensor::from_vec(starts, (self.shape.rows, 1, outcome.goal_len), &self.device).map(Some)
+        rows.flat_map(|row| (0..outcome.goal_len).map(move |index| outcome.start(row, index)))
+            .collect()
     }
 
     /// Predicts outcomes from critic inputs without features, if there is a model.
@@ -35,8 +33,7 @@ impl Graph {
         let (Some(outcome), Some(starts)) = (self.shape.outcome, &states.goal_distances) else {
             return Ok(None);
         };
-        let inputs = inputs.narrow(1, 0, self.shape.observation_len + self.shape.actions_len)?;
-        let motion = self.forward("outcome_model", of, &inputs)?;
+        let motion = self.forward("outcome_model", of, &self.model_inputs(inputs)?)?;
         let motion = motion.reshape((self.shape.rows, outcome.steps, outcome.goal_len))?;
         let distances = starts.broadcast_sub(&motion)?;
         let length = distances.sqr()?.sum_keepdim(D::Minus1)?.sqrt()?;
@@ -47,6 +44,13 @@ impl Graph {
         Ok(Some(Prediction { motion, features: features.flatten_from(1)? }))
     }
 
+    /// Returns the states and actions of critic inputs. A GPU multiplies no rows with gaps, which a
+    /// carried end state would leave.
+    pub(super) fn model_inputs(&self, critic_inputs: &Tensor) -> Result<Tensor> {
+        let len = self.shape.observation_len + self.shape.actions_len;
+        critic_inputs.narrow(1, 0, len)?.contiguous()
+    }
+
     /// Does a step of the model on the batch's own actions, if there is one, and appends its
     /// prediction before the step to the critic inputs.
     pub(super) fn outcome_step(&mut self, batch: &mut DeviceBatch) -> Result<()> {
@@ -54,7 +58,8 @@ impl Graph {
         else {
             return Ok(());
         };
-        let loss = (prediction.motion.flatten_from(1)? - &batch.motion)?.sqr()?.mean_all()?;
+        let motion = needed(&batch.motion, "motion")?;
+        let loss = (prediction.motion.flatten_from(1)? - motion)?.sqr()?.mean_all()?;
         self.descend("outcome_model", &loss, false)?;
         let features = prediction.features.detach();
         batch.critic_inputs = Tensor::cat(&[&batch.critic_inputs, &features], D::Minus1)?;

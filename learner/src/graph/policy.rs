@@ -5,6 +5,7 @@ use dmprl_shared::config::{Controller, ExperimentConfig, ForcingScaling, RhoKind
 use dmprl_shared::dmp::{Dmp, SegmentMap};
 use dmprl_shared::policy::{Head, MlpShape, Policy};
 
+use super::batch::needed;
 use crate::update::kernels::VARIANCE_EPSILON;
 
 /// Range of a raw log-std, as in `dmprl_shared::policy::gaussian`.
@@ -50,8 +51,8 @@ pub(super) struct Means {
 pub(super) struct DeviceStates {
     /// Network inputs, (B, O).
     pub inputs: Tensor,
-    /// (y0, yd0) of every row and dimension, (B A, 2); empty without a DMP.
-    pub starts: Tensor,
+    /// (y0, yd0) of every row and dimension, (B A, 2), for a DMP.
+    pub starts: Option<Tensor>,
     /// Desired minus achieved goal in thresholds, (B, 1, G), for the outcome model.
     pub goal_distances: Option<Tensor>,
 }
@@ -102,7 +103,7 @@ impl PolicyGraph {
         let outputs = outputs.narrow(1, 0, head_len)?;
         let (means, end_state) = match &self.dmp {
             None => (outputs, None),
-            Some(dmp) => dmp.segment(&outputs.contiguous()?, &states.starts)?,
+            Some(dmp) => dmp.segment(&outputs.contiguous()?, needed(&states.starts, "starts")?)?,
         };
         Ok(Means { means, end_state, raw_log_stds })
     }

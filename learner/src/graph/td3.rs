@@ -2,9 +2,9 @@
 
 use candle_core::Result;
 
-use super::batch::DeviceBatch;
-use super::{Graph, GraphAlgorithm, Of};
-use crate::algorithms::losses::Losses;
+use super::batch::{DeviceBatch, needed};
+use super::losses::DeviceLosses;
+use super::{CriticStep, Graph, GraphAlgorithm, Of};
 
 const CRITICS: [&str; 2] = ["critic_1", "critic_2"];
 
@@ -12,13 +12,14 @@ const CRITICS: [&str; 2] = ["critic_1", "critic_2"];
 pub(super) struct Td3;
 
 impl GraphAlgorithm for Td3 {
-    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, update: u64) -> Result<Losses> {
+    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, update: u64) -> Result<DeviceLosses> {
         let td3 = graph.config.algorithm.td3.clone();
         let updates_actor = update.is_multiple_of(td3.actor_interval);
 
         let next = graph.means(Of::Target, &batch.next_states)?;
         let clip = td3.target_noise_clip;
-        let noise = (&batch.next_noise * td3.target_noise_std)?.clamp(-clip, clip)?;
+        let noise = (needed(&batch.next_noise, "next_noise")? * td3.target_noise_std)?
+            .clamp(-clip, clip)?;
         let u = (next.means.tanh()? + noise)?.clamp(-1.0, 1.0)?;
         let inputs = graph.critic_inputs(&batch.next_states, &next.with_end_state(&u)?)?;
         let [first, second] = CRITICS.map(|critic| graph.forward(critic, Of::Target, &inputs));
@@ -27,9 +28,9 @@ impl GraphAlgorithm for Td3 {
         let larger = (first.maximum(&second)? * (1.0 - weight))?;
         let values = ((first.minimum(&second)? * weight)? + larger)?;
 
-        let critics = graph.fit_critics(&CRITICS, batch, &values, updates_actor)?;
-        let step = || graph.policy_gradient_step(CRITICS[0], batch, critics.q_size);
-        let loss = updates_actor.then(step).transpose()?;
-        Ok(critics.losses(loss))
+        let CriticStep { losses, q_size } =
+            graph.fit_critics(&CRITICS, batch, &values, updates_actor)?;
+        let step = || graph.policy_gradient_step(CRITICS[0], batch, &q_size);
+        Ok(DeviceLosses { actor_loss: updates_actor.then(step).transpose()?, ..losses })
     }
 }

@@ -17,8 +17,8 @@ use dmprl_shared::config::TqcConfig;
 use dmprl_shared::policy::Policy;
 
 use super::batch::DeviceBatch;
-use super::{Context, Graph, GraphAlgorithm, NamedNetworks, Of, modules};
-use crate::algorithms::losses::Losses;
+use super::losses::DeviceLosses;
+use super::{Context, CriticStep, Graph, GraphAlgorithm, NamedNetworks, Of, modules};
 use crate::algorithms::{new_actor, new_outcome_model};
 use crate::update::network::TrainableNetwork;
 
@@ -64,7 +64,7 @@ impl GraphAlgorithm for Tqc {
     }
 
     // ANCHOR: update
-    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, _: u64) -> Result<Losses> {
+    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, _: u64) -> Result<DeviceLosses> {
         let tqc = graph.config.algorithm.tqc.clone();
         let critics = &CRITICS[..tqc.critics];
 
@@ -74,24 +74,20 @@ impl GraphAlgorithm for Tqc {
         let kept = sorted.narrow(1, 0, tqc.critics * (tqc.quantiles - tqc.dropped_quantiles))?;
         let targets = batch.targets(&kept.broadcast_sub(&next.entropy_cost)?)?;
 
-        let mut losses = Losses::default();
-        let mut q_size = 0.0;
-        for (index, name) in critics.iter().enumerate() {
+        let (mut sum, mut first) = (graph.zero()?, None);
+        for name in critics {
             let quantiles = graph.forward(name, Of::Network, &batch.critic_inputs)?;
-            if index == 0 {
-                let q = quantiles.mean(1)?;
-                losses.q_mean = q.mean_all()?.to_scalar()?;
-                q_size = f64::from(q.abs()?.mean_all()?.to_scalar::<f32>()?);
-            }
             let (loss, descended) = quantile_loss(&quantiles, &targets)?;
-            losses.critic_loss += loss;
+            sum = (sum + loss)?;
+            first.get_or_insert(quantiles.detach());
             graph.descend(name, &descended, true)?;
         }
 
-        graph.soft_actor_step(batch, q_size, &mut losses, |graph, inputs| {
+        let q = first.map(|quantiles| quantiles.mean(1)).transpose()?;
+        let critic_step = CriticStep::new(sum, q)?;
+        graph.soft_actor_step(batch, critic_step, |graph, inputs| {
             graph.quantiles(critics, Of::Frozen, inputs)?.mean_keepdim(1)
-        })?;
-        Ok(losses)
+        })
     }
     // ANCHOR_END: update
 }
@@ -130,7 +126,7 @@ fn critic(context: &Context<'_>, builder: &VarBuilder<'_>) -> Result<Box<dyn Mod
 ///
 /// The second is linear in the quantiles with the loss's slope as constant, because a backward pass
 /// over all pairs of quantile and target would take most of an update's time.
-fn quantile_loss(quantiles: &Tensor, targets: &Tensor) -> Result<(f32, Tensor)> {
+fn quantile_loss(quantiles: &Tensor, targets: &Tensor) -> Result<(Tensor, Tensor)> {
     let count = quantiles.dim(1)?;
     let middles = (0..count).map(|m| (2 * m + 1) as f32 / (2 * count) as f32).collect::<Vec<_>>();
     let tau = Tensor::from_vec(middles, (1, count, 1), quantiles.device())?;
@@ -141,7 +137,7 @@ fn quantile_loss(quantiles: &Tensor, targets: &Tensor) -> Result<(f32, Tensor)> 
     // Minus the derivative with respect to the quantile, for each pair.
     let slope = tau.broadcast_sub(&below)?.abs()?.mul(&clipped)?;
     // huber(delta) = clipped (delta - clipped / 2): delta² / 2 below 1, |delta| - 1/2 above.
-    let loss = slope.mul(&(delta - (clipped * 0.5)?)?)?.mean_all()?.to_scalar()?;
+    let loss = slope.mul(&(delta - (clipped * 0.5)?)?)?.mean_all()?;
     let linear = slope.mean(2)?.mul(quantiles)?.mean_all()?.neg()?;
     Ok((loss, linear))
 }
