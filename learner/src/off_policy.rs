@@ -2,7 +2,9 @@
 //! update samples a batch from the replay. With demonstrations, the actor imitates them before and
 //! beside these updates. Called by [`crate::learner`].
 
-use dmprl_shared::config::ExperimentConfig;
+mod next_batch;
+
+use dmprl_shared::config::{Device, ExperimentConfig};
 use dmprl_shared::goal_rule::GoalRule;
 use dmprl_shared::policy::{Head, Policy};
 
@@ -10,7 +12,9 @@ use crate::algorithms::cloning::Cloning;
 use crate::algorithms::{Algorithm, Batch, Losses, SampleSource};
 use crate::error::LearnerError;
 use crate::pacing::Pacing;
+use crate::replay::Sampler;
 use crate::update::network::TrainableNetwork;
+use next_batch::NextBatch;
 
 /// An off-policy algorithm with the pacing of its updates.
 #[derive(Debug)]
@@ -20,6 +24,8 @@ pub struct OffPolicy {
     /// Account of the updates owed.
     pub pacing: Pacing,
     batch: Batch,
+    /// On a GPU.
+    next_batch: Option<NextBatch>,
     omega: f32,
     /// Imitation of demonstrations, if it is configured.
     cloning: Option<Cloning>,
@@ -55,9 +61,13 @@ impl OffPolicy {
         rule: Option<&GoalRule>,
     ) -> candle_core::Result<Self> {
         let algorithm = Algorithm::new(config, policy, rule)?;
+        // On the CPU, another thread would take a core from the update. A deterministic run is the
+        // same after a resume, which samples the batch again.
+        let samples_ahead = config.learner.device == Device::Cuda && !config.run.deterministic;
         Ok(Self {
             pacing: Pacing::new(&config.pacing),
             batch: Batch::new(algorithm.batch_shape()),
+            next_batch: samples_ahead.then(|| NextBatch::new(algorithm.batch_shape())),
             omega: match policy.head() {
                 Head::Dmp(head) => head.omega(),
                 Head::Mlp => 1.0,
@@ -89,10 +99,13 @@ impl OffPolicy {
         progress: UpdateProgress,
     ) -> Result<Losses, LearnerError> {
         let shape = self.algorithm.batch_shape();
-        self.batch.sample(shape, &config.algorithm, self.omega, &mut source)?;
+        let next = self.next_batch.as_mut();
+        if !next.is_some_and(|next| next.take(&mut self.batch, source.sampler)) {
+            self.batch.sample(shape, &config.algorithm, self.omega, &mut source)?;
+        }
         let share = imitation_share(config, progress.env_steps);
         let losses = match self.cloning.take_if(|_| share > 0.0) {
-            None => self.algorithm.update(policy, &self.batch, progress.update)?,
+            None => self.update_alone(config, policy, source, progress.update)?,
             Some(mut cloning) => {
                 let imitation = Imitation { cloning: &mut cloning, share };
                 let losses = self.update_beside(imitation, policy, source, progress.update);
@@ -102,6 +115,25 @@ impl OffPolicy {
         };
         self.pacing.updated();
         Ok(losses)
+    }
+
+    /// Does one update without imitation. On a GPU, it also samples the next batch.
+    fn update_alone(
+        &mut self,
+        config: &ExperimentConfig,
+        policy: &Policy,
+        source: SampleSource<'_>,
+        update: u64,
+    ) -> candle_core::Result<Losses> {
+        let Self { algorithm, batch, next_batch, omega, .. } = self;
+        let Some(next_batch) = next_batch else { return algorithm.update(policy, batch, update) };
+        let SampleSource { replay, sampler, hindsight, normaliser } = source;
+        let shape = algorithm.batch_shape();
+        let sample = |next: &mut Batch, sampler: &mut Sampler| {
+            let mut source = SampleSource { replay, sampler, hindsight, normaliser };
+            next.sample(shape, &config.algorithm, *omega, &mut source)
+        };
+        next_batch.sample_during(sampler, sample, || algorithm.update(policy, batch, update))
     }
 
     /// Does one update. The actor takes `1 - share` of its own step and `share` of a step of
@@ -169,6 +201,10 @@ impl OffPolicy {
         &mut self,
         mut f: impl FnMut(&'static str, &mut TrainableNetwork) -> Result<(), E>,
     ) -> Result<(), E> {
+        if let Some(next_batch) = &mut self.next_batch {
+            // Its observations may be normalised for other networks.
+            next_batch.discard();
+        }
         self.algorithm.for_each_network(&mut f)?;
         self.cloning.as_mut().map_or(Ok(()), |cloning| f("cloning", &mut cloning.actor))
     }

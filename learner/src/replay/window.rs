@@ -175,7 +175,7 @@ impl Replay {
 const TRIES_MAX: usize = 100_000;
 
 /// Draws windows uniformly, with replacement.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Sampler {
     windows: Windows,
     random: Xoshiro256PlusPlus,
