@@ -79,6 +79,8 @@ fn invalid_values_are_usage_errors() {
         &["train", "reacher", "--threads", "0"],
         #[cfg(not(feature = "cuda"))]
         &["train", "reacher", "--device", "cuda"],
+        #[cfg(not(feature = "cuda"))]
+        &["bench", "learner", "--task", "reacher", "--device", "cuda"],
         &["train", "reacher", "--max-minutes", "0"],
         &["train", "reacher", "--set", "dmp.alpha_y=1000"],
         &["train", "reacher", "--deterministic", "--workers", "4"],

@@ -84,6 +84,18 @@ fn a_task_whose_sizes_are_not_known_is_refused() {
     finished.saying("sizes").saying("reacher");
 }
 
+/// The tests' program is built without the feature `cuda`.
+#[test]
+fn a_build_without_cuda_refuses_a_gpu_and_names_the_remedy() {
+    let place = Workplace::new();
+    for device in [&["--device", "cuda"], &["--set", "learner.device=cuda"]] {
+        let more = [&["--task", "reacher"], &device[..]].concat();
+        let finished = bench(&place, &more).wait().with_status(2);
+        finished.saying("this build has no CUDA").saying("cargo build --release --features cuda");
+    }
+    assert_nothing_left(&place);
+}
+
 #[test]
 fn ctrl_c_ends_it_and_leaves_nothing() {
     let place = Workplace::new();

@@ -1,7 +1,8 @@
 //! The report of `dmprl bench learner`: one JSON object for programs, a table for people.
 
 use dmprl_run::{Machine, Manifest};
-use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::config::{Device, ExperimentConfig};
+use dmprl_supervisor::gpus;
 use serde_json::{Map, Value, json};
 
 use super::{LearnerBench, PeerKind};
@@ -40,6 +41,8 @@ pub struct Figures {
     pub(super) config: ExperimentConfig,
     pub(super) seconds: f64,
     machine: Option<Machine>,
+    /// Name, memory and driver of the GPUs, if the update runs on one.
+    gpu: Option<String>,
     load_average: Option<f64>,
     /// (name, rounds) of each available candidate.
     rounds: Vec<(&'static str, Vec<Timed>)>,
@@ -55,6 +58,7 @@ impl Figures {
             config: bench.config.clone(),
             seconds: bench.duration.as_secs_f64(),
             machine: Manifest::new(None).ok().map(|manifest| manifest.machine),
+            gpu: (bench.config.learner.device == Device::Cuda).then(gpus).flatten(),
             load_average: load_average(),
             rounds: Vec::new(),
             notes: Vec::new(),
@@ -116,8 +120,12 @@ impl Figures {
     }
 
     /// (part, its share of an update). Each part is measured alone. The rest consists of activation
-    /// functions, DMP, losses, noise and thread synchronisation.
+    /// functions, DMP, losses, noise and thread synchronisation. `None` if the update runs on
+    /// another device than its parts.
     pub(super) fn shares(&self) -> Option<[(&'static str, f64); 4]> {
+        if self.config.learner.device != Device::Cpu {
+            return None;
+        }
         let sample = self.ratio_to_ours(SAMPLE)?;
         let products = self.ratio_to_ours(self.floor())?;
         let optimiser = self.ratio_to_ours(OPTIMISER)?;
@@ -162,6 +170,8 @@ impl Figures {
             "samples_per_s": updates_per_s.map(|rate| rate * batch_size as f64),
             "batch_size": batch_size,
             "threads": self.config.learner.threads,
+            "device": self.config.learner.device,
+            "gpu": self.gpu,
             "backend": if self.config.updates_by_graph() { "graph" } else { "kernels" },
             "algorithm": self.config.algorithm.name,
             "policy": self.config.policy.kind,
@@ -198,6 +208,7 @@ pub(super) mod tests {
             config,
             seconds: 0.4,
             machine: None,
+            gpu: None,
             load_average: None,
             rounds: Vec::new(),
             notes: Vec::new(),
@@ -244,6 +255,17 @@ pub(super) mod tests {
             assert!(json[absent].is_null() && json.get(absent).is_some(), "{absent}");
         }
         assert_eq!(json["notes"]["jax"], "is not installed");
+    }
+
+    #[test]
+    fn an_update_on_a_gpu_has_no_shares_of_its_parts_on_the_cpu() {
+        let mut figures = figures();
+        figures.config.learner.device = Device::Cuda;
+        let json = figures.json();
+        assert!(json["share_of_time"].is_null(), "{json}");
+        assert_eq!((&json["device"], &json["backend"]), (&"cuda".into(), &"graph".into()));
+        let first = figures.text().lines().next().map(str::to_owned);
+        assert!(first.is_some_and(|line| line.ends_with(" · graph · cuda")), "{}", figures.text());
     }
 
     #[test]

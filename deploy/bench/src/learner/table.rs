@@ -1,6 +1,7 @@
 //! Formats the figures of `bench learner` as a table.
 
 use dmprl_run::format::grouped;
+use dmprl_shared::config::Device;
 
 use super::figures::{Figures, KERNELS, LIBRARY, OURS};
 use super::peers::PeerKind;
@@ -13,13 +14,14 @@ impl Figures {
         let (algorithm, threads) = (&self.config.algorithm, self.config.learner.threads);
         let mut lines = vec![
             format!(
-                "{} · {:?} · {:?} · batch {} · {threads} thread{}{}",
+                "{} · {:?} · {:?} · batch {} · {threads} thread{}{}{}",
                 self.config.task.name,
                 algorithm.name,
                 self.config.policy.kind,
                 algorithm.batch_size,
                 if threads == 1 { "" } else { "s" },
-                if self.config.updates_by_graph() { " · graph" } else { "" }
+                if self.config.updates_by_graph() { " · graph" } else { "" },
+                if self.config.learner.device == Device::Cuda { " · cuda" } else { "" }
             )
             .to_lowercase(),
             format!("median of {} rounds of {} s", self.rounds_len(), self.seconds),

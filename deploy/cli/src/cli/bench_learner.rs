@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
+use clap::builder::PossibleValuesParser;
 use dmprl_bench::{self as bench, LearnerBench, PeerKind};
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_shared::config::{AlgorithmName, Limits, TASKS, task_defaults};
@@ -11,7 +12,7 @@ use toml::Value;
 
 use super::bench_values::{interpreter, seconds};
 use super::configuration::{merge, refuse};
-use super::configured::{ConfiguredArgs, flag};
+use super::configured::{ConfiguredArgs, check_build, flag};
 use super::{cores, emit};
 use crate::terminal::TerminalProgress;
 
@@ -26,6 +27,10 @@ In every round each of these runs once for --seconds while the others sleep; the
                   the same update in eager PyTorch, or compiled by PyTorch or JAX, on as many
                   cores, with prepared batches (--peer; tests/peers/learner_peer.py). With a peer,
                   no actor has a penalty on changes of actions (algorithm.action_rate_penalty = 0)
+  torch, jax      the same update in eager PyTorch, or compiled by JAX, on as many cores, with
+                  prepared batches (--peer; tests/peers/learner_peer.py). With a peer, no actor
+                  has a penalty on changes of actions (algorithm.action_rate_penalty = 0)
+With --device cuda, only `ours` runs on the GPU, and samples the next batch meanwhile.
 Sampling and optimiser are also measured alone, as shares of the time. peak_memory_mb is the
 learner's (VmHWM), including its replay. Unavailable figures are null or `absent`, with the reason.
 Ctrl-C stops the benchmark and leaves nothing behind.
@@ -34,7 +39,8 @@ EXAMPLES
   dmprl bench learner --task pusher
   dmprl bench learner --algo td3 --policy mlp --task reacher --threads 2 --json
   dmprl bench learner --task pusher --peer torch --peer jax --peer-python /opt/torch/bin/python
-  dmprl bench learner --task pusher --set algorithm.batch_size=512 --rounds 9";
+  dmprl bench learner --task pusher --set algorithm.batch_size=512 --rounds 9
+  dmprl bench learner --task pusher --device cuda --set algorithm.batch_size=4096 --json";
 
 /// Arguments of `dmprl bench learner`.
 #[derive(Debug, Args)]
@@ -45,6 +51,9 @@ pub(super) struct LearnerArgs {
     task: String,
     #[command(flatten)]
     configured: ConfiguredArgs,
+    /// Device of the update; `cuda` needs a build with that feature.
+    #[arg(long, value_parser = PossibleValuesParser::new(["cpu", "cuda"]))]
+    device: Option<String>,
     /// Threads of the update and of the peers.
     #[arg(long, value_name = "N")]
     threads: Option<u32>,
@@ -79,12 +88,14 @@ pub(super) fn run(args: &LearnerArgs) -> anyhow::Result<Outcome> {
     // The peers do not implement our penalties on changes of actions.
     let no_price = (!args.peer.is_empty()).then_some(Value::Float(0.0));
     let flags = [
+        flag("--device", "learner.device", args.device.clone().map(Value::String)),
         flag("--threads", "learner.threads", threads),
         flag("--peer", "algorithm.action_rate_penalty", no_price.clone()),
         flag("--peer", "algorithm.action_acceleration_penalty", no_price),
     ];
     let sources = args.configured.sources(&args.task, flags)?;
     let config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;
+    check_build(&config)?;
     if config.algorithm.name == AlgorithmName::Ndp {
         return Err(wrong_use(
             "--algo ndp: it learns from whole rollouts, not from batches of a replay; expected \

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use dmprl_run::format::binary_bytes;
 use dmprl_run::{FileSystem, Machine};
-use dmprl_supervisor::answer;
 use dmprl_supervisor::capacity::{MachineLimits, Space};
+use dmprl_supervisor::gpus;
 use rustix::fs::{Access, access};
 
 use super::Check;
@@ -116,9 +116,7 @@ fn disk_at(path: &Path) -> Check {
 }
 
 fn gpu() -> Check {
-    let query = ["--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"];
-    let gpus = answer("nvidia-smi", &query).map(|text| text.replace('\n', "; "));
-    gpu_check(gpus.ok().filter(|text| !text.is_empty()), cfg!(feature = "cuda"))
+    gpu_check(gpus(), cfg!(feature = "cuda"))
 }
 
 fn gpu_check(gpu: Option<String>, built_with_cuda: bool) -> Check {
