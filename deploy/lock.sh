@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Locks versions and hashes of Python packages: of those that dmprl installs (envs_py/locks), of the
-# tools of the checks (.ci/tools.txt) and of the release (deploy/release-tools.txt).
+# tools of the checks (.ci/tools.txt), of CUDA for a check (.ci/cuda.txt), and of the tools of the
+# release (deploy/release-tools.txt).
 #   deploy/lock.sh            keeps the locked versions where the requirements still permit them
 #   deploy/lock.sh --upgrade  takes the newest versions
 # Needs a package index: the usual one, or UV_INDEX_URL.
@@ -10,7 +11,7 @@ upgrade=()
 case "$*" in
 "") ;;
 --upgrade) upgrade=(--upgrade) ;;
-*) sed -n 2,6p "$0" >&2; exit 2 ;;
+*) sed -n 2,7p "$0" >&2; exit 2 ;;
 esac
 
 uv_version=0.13.9
@@ -54,4 +55,5 @@ for extra in demos hub rerun search video; do
         lock envs_py/locks/$extra.txt --constraint envs_py/locks/base.txt
 done
 lock .ci/tools.txt <.ci/tools.in
+lock .ci/cuda.txt <.ci/cuda.in
 lock deploy/release-tools.txt <deploy/release-tools.in

@@ -28,7 +28,7 @@ fn assert_approved(output: &Output) {
 #[test]
 fn bash_and_its_linter_approve_of_the_scripts() {
     let slurm = ["deploy/slurm/train.sbatch", "deploy/slurm/sweep.sbatch"];
-    let checks = [".ci/run", ".ci/installed", ".ci/advisories", ".ci/tools.sh"];
+    let checks = [".ci/run", ".ci/installed", ".ci/advisories", ".ci/cuda", ".ci/tools.sh"];
     let scripts = ["deploy/lock.sh", "deploy/release.sh"];
     for script in slurm.into_iter().chain(checks).chain(scripts) {
         assert_approved(&asked("bash", &["-n", script]).expect("bash"));
