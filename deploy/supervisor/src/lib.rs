@@ -58,7 +58,6 @@ pub use answer::answer;
 pub use domain::{Place, create as create_domain, token as domain_token};
 pub use evaluate::{EvaluationPlan, evaluate};
 pub use film::{FilmProgram, film};
-pub use film::film;
 pub use gpus::gpus;
 pub use host::{HostPlan, host};
 pub use launcher::{Launcher, Upstream};

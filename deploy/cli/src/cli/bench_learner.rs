@@ -27,9 +27,6 @@ In every round each of these runs once for --seconds while the others sleep; the
                   the same update in eager PyTorch, or compiled by PyTorch or JAX, on as many
                   cores, with prepared batches (--peer; tests/peers/learner_peer.py). With a peer,
                   no actor has a penalty on changes of actions (algorithm.action_rate_penalty = 0)
-  torch, jax      the same update in eager PyTorch, or compiled by JAX, on as many cores, with
-                  prepared batches (--peer; tests/peers/learner_peer.py). With a peer, no actor
-                  has a penalty on changes of actions (algorithm.action_rate_penalty = 0)
 With --device cuda, only `ours` runs on the GPU, and samples the next batch meanwhile.
 Sampling and optimiser are also measured alone, as shares of the time. peak_memory_mb is the
 learner's (VmHWM), including its replay. Unavailable figures are null or `absent`, with the reason.
