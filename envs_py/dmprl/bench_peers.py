@@ -68,7 +68,7 @@ def gymnasium_env(plan: dict) -> Any:
             env = gymnasium.make(task_id, **options.kwargs)
             return flattened(wrapped(env, options.wrappers))
         if isinstance(named, type) and issubclass(named, gymnasium.Env):
-            limit = plan["spec"]["episode_steps"] or None
+            limit = plan["spec"]["episode_steps"] or getattr(named, "max_episode_steps", None)
             spec = gymnasium.envs.registration.EnvSpec(
                 task_id, entry_point=named, max_episode_steps=limit
             )

@@ -352,16 +352,16 @@ def _import(task_id: str, module_name: str) -> ModuleType:
             raise  # the module exists, but one of its imports is missing
         raise ModuleNotFoundError(
             f"{task_id}: no module {error.name!r} among the installed packages or in the "
-            f"directories given with --python-path{_remedy(module_name)}",
+            f"directories given with --python-path{_remedy(module_name, error.name)}",
             name=error.name,
         ) from None
 
 
-def _remedy(module_name: str) -> str:
+def _remedy(module_name: str, missing: str) -> str:
     if extra := EXTRAS.get(module_name):
         return f"; install it with: dmprl env add 'dmprl[{extra}]'"
-    here = Path(module_name.partition(".")[0])
+    here = Path(missing)
     for found in (here.with_suffix(".py"), here):
-        if found.exists():
+        if "." not in missing and found.exists():
             return f". {found} is in the current folder, so add: --python-path ."
     return ""

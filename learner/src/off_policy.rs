@@ -61,8 +61,8 @@ impl OffPolicy {
         rule: Option<&GoalRule>,
     ) -> candle_core::Result<Self> {
         let algorithm = Algorithm::new(config, policy, rule)?;
-        // On the CPU, another thread would take a core from the update. A deterministic run is the
-        // same after a resume, which samples the batch again.
+        // On the CPU, another thread would take a core from the update. A deterministic run must be
+        // the same after a resume, which would sample the batch again, with newer segments.
         let samples_ahead = config.learner.device == Device::Cuda && !config.run.deterministic;
         Ok(Self {
             pacing: Pacing::new(&config.pacing),

@@ -9,6 +9,7 @@ of the program that started it ends it too.
 import argparse
 import importlib
 import json
+import math
 import os
 import signal
 import sys
@@ -19,6 +20,9 @@ from pathlib import Path
 STARTED = time.monotonic()
 NOISE = 0.1
 """Standard deviation of TD3's exploration, as in the RL Zoo. The library's default is none."""
+
+EPISODE_STEPS_MAX = 10_000
+"""Steps after which an evaluation ends an episode, as in dmprl."""
 
 AGENTS = {
     "sb3-td3": ("stable_baselines3", "TD3"),
@@ -44,18 +48,20 @@ class Evaluator:
         start = time.monotonic()
         values = [self.episode(agent, self.first_seed + index) for index in range(self.episodes)]
         self.seconds += time.monotonic() - start
-        return None if None in values else float(sum(values) / len(values))
+        mean = float("nan") if None in values else float(sum(values) / len(values))
+        return mean if math.isfinite(mean) else None
 
     def episode(self, agent, seed):
         """Runs one episode."""
         observation, _ = self.env.reset(seed=seed)
-        total, ended, success = 0.0, False, None
-        while not ended:
+        total, success = 0.0, None
+        for _ in range(EPISODE_STEPS_MAX):
             action, _ = agent.predict(observation, deterministic=True)
             observation, reward, terminated, truncated, info = self.env.step(action)
             total += float(reward)
-            ended = terminated or truncated
-            success = info.get("is_success", success)
+            success = info.get("is_success", info.get("success", success))
+            if terminated or truncated:
+                break
         if not self.by_success:
             return total
         return None if success is None else float(success)
@@ -74,8 +80,9 @@ def make(kind, settings):
         "options": settings["options"],
         "spec": {"episode_steps": 0},
     }
-    env, evaluated = bench_peers.gymnasium_env(plan), bench_peers.gymnasium_env(plan)
+    env, evaluated = (flattened(bench_peers.gymnasium_env(plan)) for _ in range(2))
     arguments = {"learning_starts": settings["learning_starts"], "seed": settings["seed"]}
+    arguments["device"] = "cpu"  # as ours
     if name == "TD3":
         from stable_baselines3.common.noise import NormalActionNoise
 
@@ -83,6 +90,14 @@ def make(kind, settings):
         arguments["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, NOISE))
     agent = getattr(agents, name)("MlpPolicy", env, **arguments)
     return agent, evaluated, f"{module} {agents.__version__}"
+
+
+def flattened(env):
+    """Returns an environment whose observations are vectors, as in dmprl."""
+    import gymnasium
+
+    is_vector = isinstance(env.observation_space, gymnasium.spaces.Box)
+    return env if is_vector else gymnasium.wrappers.FlattenObservation(env)
 
 
 def train(agent, evaluator, settings, send):

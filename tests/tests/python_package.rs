@@ -63,6 +63,9 @@ fn the_version_and_the_address_are_the_same_everywhere() {
         let line = format!("{key}: {value}");
         assert!(citation.lines().any(|it| it == line), "CITATION.cff lacks the line {line:?}");
     }
-    let heading = format!("## [{}] - ", env!("CARGO_PKG_VERSION"));
+    let released = citation.lines().find_map(|line| line.strip_prefix("date-released: ")).unwrap();
+    let heading = format!("## [{}] - {released}\n", env!("CARGO_PKG_VERSION"));
     assert!(text("CHANGELOG.md").contains(&heading), "CHANGELOG.md lacks {heading:?}");
+    let assignment = format!("__version__ = \"{}\"\n", env!("CARGO_PKG_VERSION"));
+    assert!(text("envs_py/dmprl/__init__.py").contains(&assignment), "{assignment}");
 }

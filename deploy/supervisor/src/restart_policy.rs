@@ -95,7 +95,7 @@ pub(super) fn is_proven(
     match process {
         Process::Actor(_) => worked.last.duration_since(worked.first) >= limits.proven,
         Process::Learner | Process::Relay | Process::Gateway => {
-            now.duration_since(running.spawned) >= limits.proven
+            now.duration_since(worked.first) >= limits.proven
         }
         Process::Evaluator => false,
     }

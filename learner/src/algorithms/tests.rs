@@ -208,7 +208,7 @@ fn another_device_learns_the_same_and_hands_it_back() {
 
 /// Candle's CPU takes both, a GPU neither.
 #[test]
-fn a_graph_has_no_empty_tensor_and_no_product_of_rows_with_gaps() {
+fn a_batch_on_the_device_has_no_empty_tensor_and_no_rows_with_gaps() {
     let cases = [
         case(&[("algorithm.name", "ddpg"), ("policy.kind", "mlp")]),
         case(&[("algorithm.name", "td3"), ("policy.kind", "chunk")]),

@@ -78,7 +78,9 @@ impl Graph {
             &batch.rewards,
             &batch.bootstrap,
         ];
-        let block = Tensor::new(parts.concat(), &self.device)?;
+        let block = parts.concat();
+        let len = block.len();
+        let block = Tensor::from_vec(block, len, &self.device)?;
         let mut end = 0;
         let views = parts.map(|part| {
             end += part.len();

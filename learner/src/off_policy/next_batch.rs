@@ -3,9 +3,11 @@
 //!
 //! The learner's thread starts the GPU's operations one by one and waits for the last. Sampling
 //! takes 2.6 ms for 4096 rows (docs/decisions/0114-cuda-tree-from-wheels.md), which would be added
-//! to every update. A batch that is sampled ahead lacks the segments that arrive before its update.
+//! to every update. A batch that is sampled ahead lacks the segments that arrive before its update,
+//! and what hindsight reads from them.
 
-use std::{panic, thread};
+use std::panic;
+use std::thread::{self, ScopedJoinHandle};
 
 use crate::algorithms::{Batch, BatchShape, NoWindow};
 use crate::replay::Sampler;
@@ -25,6 +27,7 @@ impl NextBatch {
     }
 
     /// Moves the batch into `batch`, and `sampler` past its draws. Returns false if there is none.
+    /// Nothing else may have drawn from `sampler` since the batch was sampled.
     pub(super) fn take(&mut self, batch: &mut Batch, sampler: &mut Sampler) -> bool {
         let Some(advanced) = self.sampler.take() else { return false };
         std::mem::swap(&mut self.batch, batch);
@@ -33,8 +36,8 @@ impl NextBatch {
     }
 
     /// Calls `sample` on another thread and `update` on this one, and returns the result of the
-    /// latter. `sampler` stays as it is until the batch is taken, so that a checkpoint in between
-    /// draws the batch again.
+    /// latter. `sampler` stays as it is until the batch is taken, so that a run that resumes from a
+    /// checkpoint in between continues the same random stream, although with newer segments.
     pub(super) fn sample_during<T>(
         &mut self,
         sampler: &Sampler,
@@ -43,13 +46,18 @@ impl NextBatch {
     ) -> T {
         let (batch, mut sampler) = (&mut self.batch, sampler.clone());
         let (sampled, result) = thread::scope(|scope| {
-            let sampling = scope.spawn(|| sample(batch, &mut sampler));
+            let thread = thread::Builder::new().name("sample".into());
+            let sampling = thread.spawn_scoped(scope, || sample(batch, &mut sampler));
             let result = update();
-            (sampling.join(), result)
+            (sampling.map(ScopedJoinHandle::join), result)
         });
-        // Without a window, the next update samples by itself, and fails if there still is none.
-        let sampled = sampled.unwrap_or_else(|panicked| panic::resume_unwind(panicked));
-        self.sampler = sampled.is_ok().then_some(sampler);
+        // Without a window or a thread, the next update samples by itself, and fails if there still
+        // is no window.
+        self.sampler = match sampled {
+            Ok(Ok(sampled)) => sampled.is_ok().then_some(sampler),
+            Ok(Err(panicked)) => panic::resume_unwind(panicked),
+            Err(_) => None,
+        };
         result
     }
 

@@ -1,12 +1,14 @@
 //! The Python environment of the peers, made when it is first needed.
 
 use std::fs::File;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use dmprl_run::{Progress, Watch, describe, last_lines};
+use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::AgentsBench;
 
@@ -31,7 +33,14 @@ pub(super) fn prepare(
     let wanted = std::fs::read(&required)
         .with_context(|| format!("cannot read the peers' requirements {}", required.display()))?;
     let complete = folder.join(REQUIREMENTS);
-    if std::fs::read(&complete).is_ok_and(|made_for| made_for == wanted) {
+    let path = folder.with_extension("lock");
+    let lock = File::create(&path).with_context(|| format!("cannot create {}", path.display()))?;
+    if lock.try_lock().is_err() {
+        bail!("another benchmark is installing the peers into {}", folder.display());
+    }
+    // The interpreter is a link, whose target an upgrade may have removed.
+    let is_complete = std::fs::read(&complete).is_ok_and(|made_for| made_for == wanted);
+    if is_complete && python.exists() {
         return Ok(python);
     }
     progress.stage(&format!(
@@ -65,13 +74,16 @@ pub(super) fn prepare(
     Ok(python)
 }
 
-/// Kills its process when it is dropped, for instance after an interrupt.
+/// Kills its process and the processes that it started when it is dropped, for instance after an
+/// interrupt.
 struct Killed(Child);
 
 impl Drop for Killed {
     fn drop(&mut self) {
-        // An error means that it has exited already.
-        let _ = self.0.kill();
+        // An error means that all have exited already.
+        if let Some(group) = i32::try_from(self.0.id()).ok().and_then(Pid::from_raw) {
+            let _ = kill_process_group(group, Signal::KILL);
+        }
         let _ = self.0.wait();
     }
 }
@@ -80,7 +92,7 @@ fn run(mut command: Command, log: &Path, watch: &Watch) -> anyhow::Result<()> {
     let what = format!("{command:?}");
     let file = File::create(log).with_context(|| format!("cannot create {}", log.display()))?;
     let errors = file.try_clone().context("cannot use a log twice")?;
-    command.stdin(Stdio::null()).stdout(file).stderr(errors);
+    command.stdin(Stdio::null()).stdout(file).stderr(errors).process_group(0);
     let mut child = Killed(command.spawn().with_context(|| format!("cannot start {what}"))?);
     let deadline = Instant::now() + INSTALLATION;
     loop {

@@ -24,7 +24,8 @@ pub struct Figures {
 struct Candidate {
     kind: Option<AgentKind>,
     trainings: Vec<Training>,
-    absent: Option<String>,
+    /// Library and version, or why it was not trained.
+    note: Option<String>,
 }
 
 impl Candidate {
@@ -51,7 +52,7 @@ impl Candidate {
 impl Figures {
     pub(super) fn new(bench: &AgentsBench, machine: Machine) -> Self {
         let kinds = std::iter::once(None).chain(bench.peers.iter().copied().map(Some));
-        let candidate = |kind| Candidate { kind, trainings: Vec::new(), absent: None };
+        let candidate = |kind| Candidate { kind, trainings: Vec::new(), note: None };
         Self {
             config: bench.config.clone(),
             machine,
@@ -80,10 +81,10 @@ impl Figures {
         }
     }
 
-    /// Records why a peer is unavailable.
-    pub(super) fn note(&mut self, kind: AgentKind, why: String) {
+    /// Records a peer's description, or why it is unavailable.
+    pub(super) fn note(&mut self, kind: AgentKind, text: String) {
         if let Some(candidate) = self.candidates.iter_mut().find(|it| it.kind == Some(kind)) {
-            candidate.absent = Some(why);
+            candidate.note = Some(text);
         }
     }
 
@@ -114,7 +115,7 @@ impl Figures {
                 let object = json!({
                     "median_s": candidate.median_s(), "ratio": ratio,
                     "reached": candidate.reached(), "trainings": trainings,
-                    "absent": candidate.absent,
+                    "note": candidate.note,
                 });
                 (candidate.name().to_owned(), object)
             })
@@ -156,9 +157,11 @@ impl Figures {
             ),
         ];
         for candidate in &self.candidates {
-            lines.push(match &candidate.absent {
-                Some(why) => format!("  {:<11}absent: {why}", candidate.name()),
-                None => self.row(candidate),
+            lines.push(match &candidate.note {
+                Some(why) if candidate.trainings.is_empty() => {
+                    format!("  {:<11}absent: {why}", candidate.name())
+                }
+                _ => self.row(candidate),
             });
         }
         lines.extend([
@@ -188,7 +191,7 @@ impl Figures {
             format!("{}/{count}", candidate.reached()),
             format!("({:.1} to {:.1})", min(&seconds), max(&seconds)),
             grouped(middle(|it| it.env_steps as f64) as u64),
-            middle(|it| it.start_s),
+            middle(|it| it.start_s.unwrap_or(f64::NAN)),
             middle(|it| it.evaluation_s),
         )
     }
@@ -202,7 +205,7 @@ mod tests {
         Training {
             reached,
             seconds,
-            start_s: 1.0,
+            start_s: Some(1.0),
             evaluation_s: 2.0,
             env_steps: 5000,
             value: Some(-5.0),
@@ -211,7 +214,7 @@ mod tests {
 
     #[test]
     fn a_training_that_misses_the_target_counts_as_longer_than_any_other() {
-        let candidate = |trainings| Candidate { kind: None, trainings, absent: None };
+        let candidate = |trainings| Candidate { kind: None, trainings, note: None };
         let mostly = vec![training(true, 4.0), training(false, 1.0), training(true, 2.0)];
         assert_eq!(candidate(mostly).median_s(), Some(4.0));
         let rarely = vec![training(true, 4.0), training(false, 1.0)];

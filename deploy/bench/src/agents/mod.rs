@@ -74,8 +74,8 @@ struct Training {
     reached: bool,
     /// Time from the start of the process to the end.
     seconds: f64,
-    /// The part until the first environment step.
-    start_s: f64,
+    /// The part until the first environment step; `None` without one.
+    start_s: Option<f64>,
     /// The part that only evaluates; 0 if evaluations run beside the training.
     evaluation_s: f64,
     env_steps: u64,
@@ -117,8 +117,14 @@ fn measure(bench: &AgentsBench, watch: &Watch, progress: &dyn Progress) -> anyho
             progress.detail(kind.name());
             let place = folder.path().join(format!("{}-{round}", kind.name()));
             match peer::train(*kind, &python, bench, &config, &place, watch)? {
-                Ok(training) => figures.add(Some(*kind), training, progress),
-                Err(why) => figures.note(*kind, why),
+                Ok((about, training)) => {
+                    figures.note(*kind, about);
+                    figures.add(Some(*kind), training, progress);
+                }
+                Err(why) => {
+                    progress.print(&format!("{}: {why}", kind.name()));
+                    figures.note(*kind, why);
+                }
             }
         }
     }
@@ -128,6 +134,6 @@ fn measure(bench: &AgentsBench, watch: &Watch, progress: &dyn Progress) -> anyho
 /// Maximum time of a training, until it counts as hanging.
 fn limit(config: &ExperimentConfig) -> Duration {
     /// For start and end, and for the evaluation that is running at the limit.
-    const SLACK_S: f64 = 300.0;
+    const SLACK_S: f64 = 900.0;
     Duration::from_secs_f64(config.run.max_minutes * 60.0 + SLACK_S)
 }

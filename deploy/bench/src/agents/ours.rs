@@ -22,10 +22,22 @@ struct Evaluated {
     success_rate: Option<f64>,
 }
 
-#[derive(Debug, Deserialize)]
-struct FirstStep {
-    event: String,
-    after_s: f64,
+/// Notices the first environment step in the run's events.
+struct FirstStep<'a> {
+    log: &'a Path,
+    started: Instant,
+    /// Time since the start of the process.
+    after: Option<Duration>,
+}
+
+impl FirstStep<'_> {
+    fn look(&mut self) {
+        if self.after.is_none() {
+            let events = std::fs::read_to_string(self.log).unwrap_or_default();
+            let happened = events.contains("\"event\":\"first_step\"");
+            self.after = happened.then(|| self.started.elapsed());
+        }
+    }
 }
 
 /// Trains in the new folder `place`.
@@ -44,7 +56,8 @@ pub(super) fn train(
     command.arg("--run-dir").arg(&run).args(["--no-progress", "--events", "json"]);
     let started = Instant::now();
     let mut train = WholeRun::start(command, &log)?;
-    let waited = wait(&mut train, started + limit(config), watch);
+    let mut first_step = FirstStep { log: &log, started, after: None };
+    let waited = wait(&mut train, started + limit(config), watch, &mut first_step);
     let seconds = started.elapsed().as_secs_f64();
     if let Err(error) = waited {
         if train.end()?.is_none() {
@@ -52,13 +65,19 @@ pub(super) fn train(
         }
         return Err(error);
     }
-    training(Target::of(config), seconds, &run, &log)
+    training(Target::of(config), seconds, first_step.after, &run)
 }
 
 /// Waits until the run has ended successfully.
-fn wait(train: &mut WholeRun, deadline: Instant, watch: &Watch) -> anyhow::Result<()> {
+fn wait(
+    train: &mut WholeRun,
+    deadline: Instant,
+    watch: &Watch,
+    first_step: &mut FirstStep<'_>,
+) -> anyhow::Result<()> {
     loop {
         watch.check()?;
+        first_step.look();
         match train.outcome()? {
             Some(Ok(())) => return Ok(()),
             Some(Err(how)) => bail!("dmprl train failed: {how}"),
@@ -70,30 +89,31 @@ fn wait(train: &mut WholeRun, deadline: Instant, watch: &Watch) -> anyhow::Resul
     }
 }
 
-/// Reads the result from the run directory `run` and the events in `log`.
-fn training(target: Target, seconds: f64, run: &Path, log: &Path) -> anyhow::Result<Training> {
+/// Reads the result from the run directory `run`. It is the first evaluation that reached the
+/// target, since further ones may follow, otherwise the last one.
+fn training(
+    target: Target,
+    seconds: f64,
+    start: Option<Duration>,
+    run: &Path,
+) -> anyhow::Result<Training> {
     let rows = std::fs::read_to_string(run.join("evaluations.jsonl")).unwrap_or_default();
-    let last: Option<Evaluated> = match rows.lines().last() {
-        Some(line) => Some(serde_json::from_str(line).context("evaluations.jsonl")?),
-        None => None,
-    };
-    let events =
-        std::fs::read_to_string(log).with_context(|| format!("cannot read {}", log.display()))?;
-    let first = events
-        .lines()
-        .filter_map(|line| serde_json::from_str::<FirstStep>(line).ok())
-        .find(|event| event.event == "first_step");
-    let value = last.as_ref().and_then(|row| match target.is_success {
+    let rows = rows.lines().map(serde_json::from_str).collect::<Result<Vec<Evaluated>, _>>();
+    let rows = rows.context("evaluations.jsonl")?;
+    let value = |row: &Evaluated| match target.is_success {
         true => row.success_rate,
         false => Some(row.return_mean),
-    });
+    };
+    let reached = |row: &&Evaluated| value(row).is_some_and(|value| value >= target.value);
+    let first = rows.iter().find(reached);
+    let row = first.or(rows.last());
     Ok(Training {
-        reached: value.is_some_and(|value| value >= target.value),
+        reached: first.is_some(),
         seconds,
-        start_s: first.map_or(0.0, |event| event.after_s),
+        start_s: start.map(|start| start.as_secs_f64()),
         evaluation_s: 0.0,
-        env_steps: last.map_or(0, |row| row.env_steps),
-        value,
+        env_steps: row.map_or(0, |row| row.env_steps),
+        value: row.and_then(value),
     })
 }
 
@@ -102,17 +122,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn result_is_the_last_evaluation_and_the_event_of_the_first_step() {
+    fn result_is_the_first_evaluation_that_reached_the_target_or_the_last_one() {
         let folder = tempfile::tempdir().unwrap();
-        let log = folder.path().join("log");
-        let rows = "{\"env_steps\":5000,\"return_mean\":-9.0,\"success_rate\":0.5}\n\
-                    {\"env_steps\":9000,\"return_mean\":-5.0,\"success_rate\":null}\n";
+        let rows = "{\"env_steps\":5000,\"return_mean\":-9.0,\"success_rate\":null}\n\
+                    {\"env_steps\":9000,\"return_mean\":-5.0,\"success_rate\":null}\n\
+                    {\"env_steps\":9500,\"return_mean\":-6.0,\"success_rate\":null}\n";
         std::fs::write(folder.path().join("evaluations.jsonl"), rows).unwrap();
-        std::fs::write(&log, "{\"event\":\"first_step\",\"after_s\":0.5}\nnoise\n").unwrap();
-        let read = |target| training(target, 7.0, folder.path(), &log).unwrap();
-        let by_return = read(Target { is_success: false, value: -5.2 });
-        assert_eq!((by_return.reached, by_return.env_steps), (true, 9000));
-        assert_eq!((by_return.start_s, by_return.value), (0.5, Some(-5.0)));
+        let read = |target| training(target, 7.0, None, folder.path()).unwrap();
+        let by_return = |value| read(Target { is_success: false, value });
+        let (easy, hard) = (by_return(-5.2), by_return(-4.0));
+        assert_eq!((easy.reached, easy.env_steps, easy.value), (true, 9000, Some(-5.0)));
+        assert_eq!((hard.reached, hard.env_steps, hard.value), (false, 9500, Some(-6.0)));
         // The environment reports no success.
         let by_success = read(Target { is_success: true, value: 0.1 });
         assert_eq!((by_success.reached, by_success.value), (false, None));

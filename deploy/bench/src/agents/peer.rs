@@ -52,7 +52,8 @@ struct State {
     evaluation_s: f64,
 }
 
-/// Trains in the new folder `place`. Returns the reason if the peer is unavailable.
+/// Trains in the new folder `place`. Returns the peer's description and the result, or the reason
+/// why the peer is unavailable or failed.
 pub(super) fn train(
     kind: AgentKind,
     python: &Path,
@@ -60,7 +61,7 @@ pub(super) fn train(
     config: &ExperimentConfig,
     place: &Path,
     watch: &Watch,
-) -> anyhow::Result<Result<Training, String>> {
+) -> anyhow::Result<Result<(String, Training), String>> {
     std::fs::create_dir(place).with_context(|| format!("cannot make {}", place.display()))?;
     let (settings, log) = (place.join("settings.json"), place.join("log"));
     std::fs::write(&settings, settings_of(config).to_string())
@@ -78,25 +79,28 @@ pub(super) fn train(
         .env("PYTHONDONTWRITEBYTECODE", "1")
         .stderr(errors);
     let mut child = LineChild::start(kind.name().to_owned(), command, &log)?;
-    if let Err(why) = child.greeting(watch, limit(config))? {
-        return Ok(Err(why));
-    }
+    let about = match child.greeting(watch, limit(config))? {
+        Ok(about) => about,
+        Err(why) => return Ok(Err(why)),
+    };
     loop {
-        let line = child.next_line(watch, limit(config), "the next evaluation")?;
+        let next = child.next_line_if_any(watch, limit(config), "the next evaluation")?;
+        let Some(line) = next else { return Ok(Err(child.exit_summary())) };
         let seconds = child.started().elapsed().as_secs_f64();
         let Ok(state) = serde_json::from_str::<State>(&line) else {
             return Err(child.unexpected_line(&line));
         };
         if state.ended {
             let target = Target::of(config);
-            return Ok(Ok(Training {
+            let training = Training {
                 reached: state.value.is_some_and(|value| value >= target.value),
                 seconds,
-                start_s: state.start_s,
+                start_s: Some(state.start_s),
                 evaluation_s: state.evaluation_s,
                 env_steps: state.env_steps,
                 value: state.value,
-            }));
+            };
+            return Ok(Ok((about, training)));
         }
     }
 }

@@ -68,11 +68,13 @@ pub(super) struct PeersArgs {
 }
 
 pub(super) fn run(args: &PeersArgs) -> anyhow::Result<Outcome> {
-    let number = |value: Option<f64>| value.map(Value::Float);
+    let number = |value: f64| Some(Value::Float(value));
+    // The other goal of a configuration file is not one of this benchmark.
+    let goal = |value: Option<f64>| number(value.unwrap_or(f64::INFINITY));
     let flags = [
-        flag("--until-return", "run.until_return", number(args.until_return)),
-        flag("--until-success", "run.until_success", number(args.until_success)),
-        flag("--max-minutes", "run.max_minutes", number(Some(args.max_minutes))),
+        flag("--until-return", "run.until_return", goal(args.until_return)),
+        flag("--until-success", "run.until_success", goal(args.until_success)),
+        flag("--max-minutes", "run.max_minutes", number(args.max_minutes)),
         flag("--steps", "run.steps", args.steps.map(|steps| Value::Integer(steps.into()))),
     ];
     let config = merge(&args.configured.sources(&args.task, flags)?)?;
@@ -80,6 +82,13 @@ pub(super) fn run(args: &PeersArgs) -> anyhow::Result<Outcome> {
     make_absolute(&mut config)?;
     if !config.run.max_minutes.is_finite() {
         return Err(wrong_use("--max-minutes inf: a training that never learns would not end"));
+    }
+    let targets = [args.until_return, args.until_success];
+    if targets.into_iter().flatten().any(|value| !value.is_finite()) {
+        return Err(wrong_use("--until-return, --until-success: expected a number, not inf"));
+    }
+    if config.task.randomise != Default::default() {
+        return Err(wrong_use("task.randomise: the peers' environments cannot be randomised"));
     }
     let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
     let venv = prepare_python()?;

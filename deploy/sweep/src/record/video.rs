@@ -112,6 +112,12 @@ pub fn record(
     if make(plan, FilmProgram::Video, &film, progress)? == Outcome::Interrupted {
         return Ok(None);
     }
+    let moved = |path: PathBuf| {
+        let to = plan.output.join(path.file_name().unwrap_or_default());
+        std::fs::rename(&path, &to).map(|()| to).with_context(cannot)
+    };
+    // Before the log is written, so that a failure there costs only the log.
+    let (mp4, gif, strip) = (moved(files.mp4)?, moved(files.gif)?, moved(files.strip)?);
     let rrd = plan.rerun.then(|| file(".rrd"));
     if let Some(rrd) = &rrd {
         let log = rerun_plan::write(&sides, rrd, temporary.path())?;
@@ -120,17 +126,7 @@ pub fn record(
             return Ok(None);
         }
     }
-    let moved = |path: PathBuf| {
-        let to = plan.output.join(path.file_name().unwrap_or_default());
-        std::fs::rename(&path, &to).map(|()| to).with_context(cannot)
-    };
-    Ok(Some(Recordings {
-        mp4: moved(files.mp4)?,
-        gif: moved(files.gif)?,
-        strip: moved(files.strip)?,
-        rrd: rrd.map(moved).transpose()?,
-        sides,
-    }))
+    Ok(Some(Recordings { mp4, gif, strip, rrd: rrd.map(moved).transpose()?, sides }))
 }
 
 /// Makes the files that `described` describes.
