@@ -209,6 +209,7 @@ fn every_flag_that_is_shown_exists() {
         "play",
         "bench rollout",
         "bench learner",
+        "bench peers",
         "bench policy",
         "bench system",
         "bench scale",

@@ -44,15 +44,19 @@ use anyhow::Context;
 use clap::{Parser, Subcommand};
 use dmprl_bench::{SegmentFeederArgs, TransportWorkerArgs, segment_feeder, transport_worker};
 use dmprl_run::failure::{Outcome, exit_status, render, wrong_use};
-use dmprl_run::{Progress, RunDirectory, Session, Zoo};
+use dmprl_run::{RunDirectory, Session, Zoo};
 use dmprl_shared::config::ExperimentConfig;
 
 use crate::roles::{
     self, ActorArgs, EvaluatorArgs, GatewayArgs, LearnerArgs, ObserverArgs, RelayArgs,
 };
+use crate::terminal::ProgressStyle;
+#[cfg(feature = "python")]
+use crate::terminal::TerminalProgress;
 use crate::terminal::messages::{self, MessageStyle};
-use crate::terminal::{ProgressStyle, TerminalProgress};
 pub use dmprl_run::PANIC_STATUS;
+#[cfg(feature = "python")]
+use dmprl_run::Progress;
 #[cfg(feature = "python")]
 use dmprl_supervisor::python_setup::{Home, PythonEnvironment, ensure_extra, packages};
 use session::name_limits;
