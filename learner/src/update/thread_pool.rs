@@ -1,6 +1,7 @@
 //! The threads of an update. A job consists of independent parts, which the threads share.
 //!
-//! Any thread may compute any part. The result of a part depends only on its index, and no two
+//! Any thread may compute any part, but each begins with its own: in every job of an update the same
+//! thread then computes the same rows, which are still in its core's cache. The result of a part depends only on its index, and no two
 //! parts write the same result, so the number of threads does not change a single bit.
 
 use std::sync::PoisonError;
@@ -29,7 +30,9 @@ struct Shared {
     jobs_started: AtomicU32,
     job: Mutex<Job>,
     job_available: Condvar,
-    next_part: AtomicUsize,
+    /// Next part of each thread's own range. A thread that has finished its range takes parts from
+    /// those of the others.
+    next_parts: Box<[AtomicUsize]>,
     /// Helpers that have not finished the current job.
     busy: AtomicUsize,
     panicked: AtomicBool,
@@ -57,14 +60,14 @@ impl ThreadPool {
             jobs_started: AtomicU32::new(0),
             job: Mutex::new(Job { work: None, parts: 0, shutdown: false }),
             job_available: Condvar::new(),
-            next_part: AtomicUsize::new(0),
+            next_parts: (0..threads.max(1)).map(|_| AtomicUsize::new(0)).collect(),
             busy: AtomicUsize::new(0),
             panicked: AtomicBool::new(false),
         });
         let helper = |index: usize| {
             let shared = Arc::clone(&shared);
             let name = format!("update-{index}");
-            let spawned = thread::Builder::new().name(name).spawn(move || shared.run_helper());
+            let spawned = thread::Builder::new().name(name).spawn(move || shared.run_helper(index));
             spawned.expect("cannot start a thread of the update")
         };
         let helpers = (1..threads).map(helper).collect();
@@ -81,7 +84,9 @@ impl ThreadPool {
             return (0..parts).for_each(work);
         }
         let shared = &*self.shared;
-        shared.next_part.store(0, Ordering::Relaxed);
+        for (thread, next) in shared.next_parts.iter().enumerate() {
+            next.store(shared.range_start(thread, parts), Ordering::Relaxed);
+        }
         shared.busy.store(self.helpers.len(), Ordering::Relaxed);
         // Set by a helper if the previous job panicked on the calling thread as well.
         shared.panicked.store(false, Ordering::Relaxed);
@@ -96,7 +101,7 @@ impl ThreadPool {
         drop(job);
         shared.job_available.notify_all();
         let wait = WaitForHelpers(shared);
-        shared.take_parts(parts, work);
+        shared.take_parts(0, parts, work);
         drop(wait);
         assert!(!shared.panicked.load(Ordering::Acquire), "a thread of the update panicked");
     }
@@ -152,18 +157,28 @@ impl Shared {
         self.job.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn take_parts(&self, parts: usize, work: &(dyn Fn(usize) + Sync)) {
-        loop {
-            let part = self.next_part.fetch_add(1, Ordering::Relaxed);
-            if part >= parts {
-                return;
+    /// Returns the first part of a thread's range. It ends where the next thread's begins.
+    fn range_start(&self, thread: usize, parts: usize) -> usize {
+        thread * parts / self.next_parts.len()
+    }
+
+    /// Computes the parts of the range of `thread`, then those that other threads have not begun.
+    fn take_parts(&self, thread: usize, parts: usize, work: &(dyn Fn(usize) + Sync)) {
+        let threads = self.next_parts.len();
+        for owner in (thread..threads).chain(0..thread) {
+            let end = self.range_start(owner + 1, parts);
+            loop {
+                let part = self.next_parts[owner].fetch_add(1, Ordering::Relaxed);
+                if part >= end {
+                    break;
+                }
+                work(part);
             }
-            work(part);
         }
     }
 
     /// Takes part in every job until the pool is dropped.
-    fn run_helper(&self) {
+    fn run_helper(&self, thread: usize) {
         let mut seen = 0;
         loop {
             let mut spins = 0;
@@ -185,7 +200,7 @@ impl Shared {
                 // SAFETY: `run` waits until `busy` is zero, so the closure is still borrowed.
                 let work = unsafe { &*work };
                 let done = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-                    self.take_parts(parts, work);
+                    self.take_parts(thread, parts, work);
                 }));
                 if done.is_err() {
                     self.panicked.store(true, Ordering::Release);
