@@ -1,8 +1,9 @@
 //! The threads of an update. A job consists of independent parts, which the threads share.
 //!
-//! Any thread may compute any part, but each begins with its own: in every job of an update the same
-//! thread then computes the same rows, which are still in its core's cache. The result of a part depends only on its index, and no two
-//! parts write the same result, so the number of threads does not change a single bit.
+//! Any thread may compute any part, but each begins with its own: in every job of an update the
+//! same thread then computes the same rows, which are still in its core's cache. The result of a
+//! part depends only on its index, and no two parts write the same result, so the number of threads
+//! does not change a single bit.
 
 use std::sync::PoisonError;
 
