@@ -15,8 +15,8 @@ use std::{
 
 use dmprl_actors::python_env::LINKED_PYTHON;
 use dmprl_supervisor::python_setup::{
-    Home, Overview, PythonEnvironment, State, add_packages, ensure, ensure_extra, overview,
-    remove_packages,
+    Home, Overview, PythonEnvironment, State, add_packages, ensure, ensure_extra, ensure_separate,
+    overview, remove_packages,
 };
 
 const MANIFEST: &str = "\
@@ -368,4 +368,27 @@ fn sha256(bytes: &[u8]) -> String {
     fs::write(file.path(), bytes).unwrap();
     let output = Command::new("sha256sum").arg(file.path()).output().unwrap();
     String::from_utf8(output.stdout).unwrap().split(' ').next().unwrap().to_owned()
+}
+
+#[test]
+fn a_separate_environment_is_made_once_for_its_requirements() {
+    let folder = tempfile::tempdir().unwrap();
+    let (venv, requirements) = (folder.path().join(".venv-other"), folder.path().join("list.txt"));
+    let mark = venv.join("mark");
+    let ensured = || ensure_separate(&venv, &requirements, &|_| ()).map(|it| it.executable);
+    let error = format!("{:#}", ensured().unwrap_err());
+    assert!(error.contains("list.txt, a file of a clone"), "{error}");
+    fs::write(&requirements, "# nothing\n").unwrap();
+    assert!(ensured().unwrap().starts_with(&venv));
+    fs::write(&mark, "").unwrap();
+    ensured().unwrap();
+    assert!(mark.exists());
+    // Another list, then an interpreter that has disappeared.
+    fs::write(&requirements, "# still nothing\n").unwrap();
+    ensured().unwrap();
+    assert!(!mark.exists());
+    fs::write(&mark, "").unwrap();
+    fs::remove_file(venv.join("bin/python")).unwrap();
+    ensured().unwrap();
+    assert!(!mark.exists());
 }

@@ -59,12 +59,19 @@ fn returns(values: &Value) -> Vec<f64> {
     values.as_array().unwrap().iter().map(|value| value.as_f64().unwrap()).collect()
 }
 
+/// Trains two policies, `dmp` and `mlp`; returns the paths of their runs.
+fn two_runs(place: &Workplace) -> [String; 2] {
+    ["dmp", "mlp"].map(|policy| {
+        let run = place.path(policy);
+        place.run(&train("reacher", &run, &["--steps", "1000", "--policy", policy])).with_status(0);
+        run
+    })
+}
+
 #[test]
 fn two_runs_side_by_side_show_the_episodes_that_eval_runs() {
     let place = Workplace::new();
-    let (run, other) = (place.path("run"), place.path("other"));
-    place.run(&train("reacher", &run, &["--steps", "1000"])).with_status(0);
-    place.run(&train("reacher", &other, &["--steps", "1000", "--policy", "mlp"])).with_status(0);
+    let [run, other] = two_runs(&place);
     if !can_draw() {
         return;
     }
@@ -96,9 +103,7 @@ fn two_runs_side_by_side_show_the_episodes_that_eval_runs() {
 #[test]
 fn a_rerun_log_of_two_runs_is_written_beside_the_video() {
     let place = Workplace::new();
-    let (run, other) = (place.path("run"), place.path("other"));
-    place.run(&train("reacher", &run, &["--steps", "1000"])).with_status(0);
-    place.run(&train("reacher", &other, &["--steps", "1000", "--policy", "mlp"])).with_status(0);
+    let [run, other] = two_runs(&place);
     if !can_draw() {
         return;
     }
@@ -110,15 +115,15 @@ fn a_rerun_log_of_two_runs_is_written_beside_the_video() {
     let read = python(&["-c", READ_LOG, log]);
     assert!(read.status.success(), "{}", String::from_utf8_lossy(&read.stderr));
     let rows: Value = serde_json::from_slice(&read.stdout).unwrap();
-    for side in ["run", "other"] {
+    for side in ["dmp", "mlp"] {
         for (entity, expected) in [("camera", 51), ("command/action\\[1\\]", 50), ("return", 51)] {
             let path = format!("/{side}/episode_1000/{entity}");
             assert_eq!(rows[&path], expected, "{path}: {rows}");
         }
     }
     // Ten segments of five steps, and fifty decisions.
-    assert_eq!(rows["/run/episode_1000/segment/goal/action\\[0\\]"], 10, "{rows}");
-    assert_eq!(rows["/other/episode_1000/segment/index"], 50, "{rows}");
+    assert_eq!(rows["/dmp/episode_1000/segment/goal/action\\[0\\]"], 10, "{rows}");
+    assert_eq!(rows["/mlp/episode_1000/segment/index"], 50, "{rows}");
     place.assert_no_process();
 }
 

@@ -6,7 +6,6 @@
 //! from its start to the end of the evaluation that reaches the target. Evaluations, environments
 //! and the number of steps before the first update are the same for all.
 
-mod environment;
 mod figures;
 mod ours;
 mod peer;
@@ -34,13 +33,9 @@ pub struct AgentsBench {
     pub peers: Vec<AgentKind>,
     /// Number of seeds, beginning with the configured one.
     pub seeds: u64,
-    /// Python interpreter of the peers; without one, an environment is made for them.
-    pub peer_python: Option<PathBuf>,
-    /// Python interpreter that makes this environment.
-    pub python: PathBuf,
-    /// Folder of this environment.
-    pub environment: PathBuf,
-    /// Folder with the peers' script and requirements.
+    /// Python interpreter of the peers.
+    pub peer_python: PathBuf,
+    /// Folder with the peers' script.
     pub peers_path: PathBuf,
     /// Folder with the package `dmprl`.
     pub package_path: PathBuf,
@@ -84,10 +79,10 @@ struct Training {
 }
 
 /// Runs the benchmark; returns `None` if the user interrupted it. Removes all its processes and
-/// files, apart from the peers' environment.
+/// files.
 ///
 /// # Errors
-/// The peers' environment cannot be made, or a training fails.
+/// One of our trainings fails.
 pub fn agents(bench: &AgentsBench, progress: &dyn Progress) -> anyhow::Result<Option<Figures>> {
     let watch = Watch::start()?;
     match measure(bench, &watch, progress) {
@@ -99,11 +94,6 @@ pub fn agents(bench: &AgentsBench, progress: &dyn Progress) -> anyhow::Result<Op
 fn measure(bench: &AgentsBench, watch: &Watch, progress: &dyn Progress) -> anyhow::Result<Figures> {
     let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
     let folder = folder.context("cannot make a folder for the trainings")?;
-    let python = match &bench.peer_python {
-        Some(python) => python.clone(),
-        None if bench.peers.is_empty() => bench.python.clone(),
-        None => environment::prepare(bench, watch, progress)?,
-    };
     let mut figures = Figures::new(bench, Manifest::new(None)?.machine);
     for round in 0..bench.seeds {
         announce_round(progress, round as usize, bench.seeds as usize);
@@ -116,7 +106,7 @@ fn measure(bench: &AgentsBench, watch: &Watch, progress: &dyn Progress) -> anyho
         for kind in &bench.peers {
             progress.detail(kind.name());
             let place = folder.path().join(format!("{}-{round}", kind.name()));
-            match peer::train(*kind, &python, bench, &config, &place, watch)? {
+            match peer::train(*kind, bench, &config, &place, watch)? {
                 Ok((about, training)) => {
                     figures.note(*kind, about);
                     figures.add(Some(*kind), training, progress);

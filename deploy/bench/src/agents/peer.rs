@@ -56,7 +56,6 @@ struct State {
 /// why the peer is unavailable or failed.
 pub(super) fn train(
     kind: AgentKind,
-    python: &Path,
     bench: &AgentsBench,
     config: &ExperimentConfig,
     place: &Path,
@@ -67,7 +66,7 @@ pub(super) fn train(
     std::fs::write(&settings, settings_of(config).to_string())
         .with_context(|| format!("cannot write {}", settings.display()))?;
     let errors = File::create(&log).with_context(|| format!("cannot make {}", log.display()))?;
-    let mut command = Command::new(python);
+    let mut command = Command::new(&bench.peer_python);
     command
         .arg(bench.peers_path.join("agent_peer.py"))
         .args([kind.name(), "--settings"])

@@ -11,15 +11,15 @@ use toml::Value;
 use super::bench_values::interpreter;
 use super::configuration::{merge, refuse};
 use super::configured::{ConfiguredArgs, flag, make_absolute};
-use super::{cores, emit, prepare_python, python_home, python_of, this_program};
+use super::{cores, emit, prepare_python, python_home, separate_python, this_program};
 use crate::terminal::TerminalProgress;
 
 const HELP: &str = "\
 Trains one seed after another with each candidate, in turns, until an evaluation reaches the target.
 The time runs from the start of the process, imports included. Ours is a whole `dmprl train`, up to
-its end. A peer has its library's default settings (TD3: with Gaussian noise of 0.1), one
-environment, ours' number of steps before the first update and ours' evaluations: the same seeds,
-number of episodes and interval.
+its end. A peer has one environment, the CPU, and its library's default settings (TD3: with Gaussian
+noise of 0.1). All have the same number of steps before the first update, and the same interval,
+episodes and seeds of evaluations.
 Without --peer-python, the peers' packages are installed into .venv-peers on first use.
 Ctrl-C stops the benchmark and removes its processes and trainings.
 
@@ -91,20 +91,22 @@ pub(super) fn run(args: &PeersArgs) -> anyhow::Result<Outcome> {
         return Err(wrong_use("task.randomise: the peers' environments cannot be randomised"));
     }
     let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
-    let venv = prepare_python()?;
+    prepare_python()?;
     let mut peers = args.peer.clone();
     peers.sort();
     peers.dedup();
     let root = dmprl_run::project::root()?;
+    let peers_path = root.join("tests/peers");
     let bench = AgentsBench {
         program: this_program()?,
         config,
         peers,
         seeds: args.seeds,
-        peer_python,
-        python: python_of(&venv),
-        environment: root.join(".venv-peers"),
-        peers_path: root.join("tests/peers"),
+        peer_python: match peer_python {
+            Some(python) => python,
+            None => separate_python(&root.join(".venv-peers"), &peers_path.join("agents.txt"))?,
+        },
+        peers_path,
         package_path: python_home()?.1,
     };
     let Some(figures) = bench::agents(&bench, &TerminalProgress::default())? else {

@@ -58,7 +58,9 @@ pub use dmprl_run::PANIC_STATUS;
 #[cfg(feature = "python")]
 use dmprl_run::Progress;
 #[cfg(feature = "python")]
-use dmprl_supervisor::python_setup::{Home, PythonEnvironment, ensure_extra, packages};
+use dmprl_supervisor::python_setup::{
+    Home, PythonEnvironment, ensure_extra, ensure_separate, packages,
+};
 use session::name_limits;
 pub use session::{TrainingPlan, train_session};
 
@@ -315,6 +317,19 @@ fn python_home() -> anyhow::Result<(PathBuf, PathBuf)> {
 #[cfg(not(feature = "python"))]
 fn prepare_python_with(_extra: &str) -> anyhow::Result<(PathBuf, PathBuf)> {
     prepare_python().map(|venv| (venv.clone(), python_of(&venv)))
+}
+
+/// Installs the packages of the file `requirements` into an environment of their own, unless it has
+/// them, and shows the progress; returns its interpreter.
+#[cfg(feature = "python")]
+fn separate_python(venv: &Path, requirements: &Path) -> anyhow::Result<PathBuf> {
+    let progress = TerminalProgress::default();
+    Ok(ensure_separate(venv, requirements, &|line| progress.state(line))?.executable)
+}
+
+#[cfg(not(feature = "python"))]
+fn separate_python(_venv: &Path, _requirements: &Path) -> anyhow::Result<PathBuf> {
+    prepare_python()
 }
 
 /// Returns the interpreter of a virtual environment.

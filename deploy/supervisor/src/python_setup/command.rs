@@ -25,11 +25,11 @@ const PROGRESS_INTERVAL: Duration = Duration::from_secs(1);
 /// full, the command blocks.
 const QUEUED_LINES_MAX: usize = 256;
 
-/// A set-up of `.venv` in progress.
+/// A set-up of an environment in progress.
 pub(super) struct Setup<'a> {
     /// The environment to create.
     pub environment: &'a PythonEnvironment,
-    /// The lock, held until the last command that writes into `.venv` has ended.
+    /// The lock, held until the last command that writes into it has ended.
     pub lock: &'a File,
     /// Called with each progress line.
     pub progress: &'a dyn Fn(&str),
@@ -41,7 +41,8 @@ impl Setup<'_> {
         stamp::begin(&self.environment.venv)?;
         let mut command = Command::new(LINKED_PYTHON.executable);
         command.args(["-I", "-m", "venv"]).arg(&self.environment.venv);
-        let phase = format!("creating .venv with Python {}", LINKED_PYTHON.version_number());
+        let name = self.environment.venv.file_name().unwrap_or_default().to_string_lossy();
+        let phase = format!("creating {name} with Python {}", LINKED_PYTHON.version_number());
         self.run(&phase, command)
     }
 
@@ -61,6 +62,11 @@ impl Setup<'_> {
         let arguments: [&OsStr; 3] =
             ["--require-hashes".as_ref(), "--requirement".as_ref(), lock.as_ref()];
         self.pip_install(phase, &arguments)
+    }
+
+    /// Installs the packages of a requirements file.
+    pub fn install_listed(&self, requirements: &Path) -> Result<()> {
+        self.pip_install("installing packages", &["--requirement".as_ref(), requirements.as_ref()])
     }
 
     /// Installs these requirements, in pip's syntax, in versions that go with each other. Otherwise

@@ -9,15 +9,13 @@ use std::{
 
 use anyhow::{Context, Result, bail};
 
-use super::paths::VENV;
-
 /// Maximum wait for the lock, longer than an installation over a slow connection takes.
 const WAIT_MAX: Duration = Duration::from_secs(30 * 60);
 /// Interval between attempts to take the lock, each with a progress line.
 const INTERVAL: Duration = Duration::from_millis(500);
 
-/// Waits for a concurrent start that creates the same `.venv`. The system releases the lock with
-/// its last holder, so a crash leaves no stale lock.
+/// Waits for a concurrent start that creates the same environment. The system releases the lock
+/// with its last holder, so a crash leaves no stale lock.
 pub(super) fn locked(path: &Path, progress: &dyn Fn(&str)) -> Result<File> {
     let lock = File::options()
         .create(true)
@@ -41,7 +39,8 @@ pub(super) fn locked(path: &Path, progress: &dyn Fn(&str)) -> Result<File> {
         thread::sleep(INTERVAL);
     }
     bail!(
-        "another process has been creating {VENV} for {} minutes; stop it, or its pip, and retry",
+        "another process has been creating {} for {} minutes; stop it, or its pip, and retry",
+        path.with_extension("").display(),
         WAIT_MAX.as_secs() / 60
     )
 }

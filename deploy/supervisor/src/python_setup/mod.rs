@@ -26,6 +26,7 @@ mod old;
 mod packages;
 mod paths;
 mod requirement;
+mod separate;
 mod stamp;
 mod together;
 mod user_packages;
@@ -38,4 +39,5 @@ pub use self::{
     home::Home,
     old::OldEnvironment,
     packages::packages,
+    separate::ensure_separate,
 };
