@@ -75,6 +75,12 @@ impl InstructionSet {
         false
     }
 
+    /// Returns whether vectors have 8 numbers.
+    #[cfg(target_arch = "x86_64")]
+    fn has_avx2(self) -> bool {
+        matches!(self.0, Arch::V3(_))
+    }
+
     fn run<W: WithSimd>(self, work: W) -> W::Output {
         self.0.dispatch(work)
     }

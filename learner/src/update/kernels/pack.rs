@@ -39,11 +39,20 @@ pub fn pack(
     for (weights, panel) in weights.chunks(PANEL * inputs).zip(panels) {
         let mut done = 0;
         #[cfg(target_arch = "x86_64")]
-        if instructions.has_avx512() && weights.len() == panel.len() {
-            done = inputs / PANEL * PANEL;
-            for input in (0..done).step_by(PANEL) {
-                // SAFETY: `has_avx512` checked that the processor has these instructions.
-                unsafe { transpose(&weights[input..], inputs, &mut panel[input * PANEL..]) };
+        if weights.len() == panel.len() {
+            if instructions.has_avx512() {
+                done = inputs / PANEL * PANEL;
+                for input in (0..done).step_by(PANEL) {
+                    // SAFETY: `has_avx512` checked that the processor has these instructions.
+                    unsafe { transpose(&weights[input..], inputs, &mut panel[input * PANEL..]) };
+                }
+            } else if instructions.has_avx2() {
+                done = inputs / 8 * 8;
+                for (input, output) in (0..done).step_by(8).flat_map(|i| [(i, 0), (i, 8)]) {
+                    let rows = &weights[output * inputs + input..];
+                    // SAFETY: `has_avx2` checked that the processor has these instructions.
+                    unsafe { transpose_8(rows, inputs, &mut panel[input * PANEL + output..]) };
+                }
             }
         }
         #[cfg(not(target_arch = "x86_64"))]
@@ -55,6 +64,46 @@ pub fn pack(
             for (weight, packed) in row.iter().zip(panel.chunks_exact_mut(PANEL)).skip(done) {
                 packed[output] = *weight;
             }
+        }
+    }
+}
+
+/// Transposes 8 rows of 8 numbers that are `stride` apart into 8 rows that are [`PANEL`] apart.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx")]
+fn transpose_8(rows: &[f32], stride: usize, out: &mut [f32]) {
+    use std::arch::x86_64::{
+        _mm256_castpd_ps, _mm256_castps_pd, _mm256_loadu_ps, _mm256_permute2f128_ps,
+        _mm256_setzero_ps, _mm256_storeu_ps, _mm256_unpackhi_pd, _mm256_unpackhi_ps,
+        _mm256_unpacklo_pd, _mm256_unpacklo_ps,
+    };
+    assert!(rows.len() >= 7 * stride + 8 && out.len() >= 7 * PANEL + 8);
+    let mut at = [_mm256_setzero_ps(); 8];
+    for (i, row) in at.iter_mut().enumerate() {
+        // SAFETY: row i ends at i * stride + 8, within `rows` (asserted above).
+        *row = unsafe { _mm256_loadu_ps(rows.as_ptr().add(i * stride)) };
+    }
+    // Within halves of four numbers: pairs of rows, then pairs of pairs.
+    for i in (0..8).step_by(2) {
+        let (a, b) = (at[i], at[i + 1]);
+        (at[i], at[i + 1]) = (_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b));
+    }
+    for i in [0, 1, 4, 5] {
+        let (a, b) = (_mm256_castps_pd(at[i]), _mm256_castps_pd(at[i + 2]));
+        at[i] = _mm256_castpd_ps(_mm256_unpacklo_pd(a, b));
+        at[i + 2] = _mm256_castpd_ps(_mm256_unpackhi_pd(a, b));
+    }
+    // Columns 0, 1, 2 and 3 of four rows are now at 0, 2, 1 and 3.
+    for (column, i) in [0, 2, 1, 3].into_iter().enumerate() {
+        let (upper, lower) = (at[i], at[i + 4]);
+        let halves = [
+            _mm256_permute2f128_ps::<0x20>(upper, lower),
+            _mm256_permute2f128_ps::<0x31>(upper, lower),
+        ];
+        for (half, row) in halves.into_iter().enumerate() {
+            let first = (column + 4 * half) * PANEL;
+            // SAFETY: the last row ends at 7 * PANEL + 8, within `out` (asserted above).
+            unsafe { _mm256_storeu_ps(out.as_mut_ptr().add(first), row) };
         }
     }
 }

@@ -162,7 +162,7 @@ impl<S: Simd> Tiled<S> for Job<'_> {
             let gradient = &shard.gradient[row..];
             let left = Broadcast { data: gradient, row_stride: 1, depth_stride: outputs_len };
             let inputs = &shard.inputs[self.column..];
-            let right = Wide { data: inputs, stride: inputs_len, width, next: None };
+            let right = Wide { data: inputs, stride: inputs_len, width, next: Some(PANEL) };
             sums = if width == PANEL {
                 accumulate::<S, M, V, false>(simd, sums, left, right, rows)
             } else {
