@@ -44,35 +44,10 @@ fn candidate(name: &str, operations: Option<usize>, work: impl FnMut() + 'static
 /// registers.
 fn peak() -> Candidate {
     const ROUNDS: usize = 20_000;
-    struct Chains;
-    impl pulp::WithSimd for Chains {
-        type Output = f32;
-
-        #[inline(always)]
-        fn with_simd<S: pulp::Simd>(self, simd: S) -> f32 {
-            let (factor, term) = (simd.splat_f32s(black_box(0.5)), simd.splat_f32s(black_box(0.1)));
-            let mut sums = [simd.splat_f32s(0.0); 12];
-            for _ in 0..ROUNDS {
-                for sum in &mut sums {
-                    *sum = simd.mul_add_f32s(*sum, factor, term);
-                }
-            }
-            sums.into_iter().map(|sum| simd.reduce_sum_f32s(sum)).sum()
-        }
-    }
-    struct Lanes;
-    impl pulp::WithSimd for Lanes {
-        type Output = usize;
-
-        #[inline(always)]
-        fn with_simd<S: pulp::Simd>(self, _: S) -> usize {
-            S::F32_LANES
-        }
-    }
-    let arch = pulp::Arch::new();
-    let operations = 2 * 12 * ROUNDS * arch.dispatch(Lanes);
+    let instructions = InstructionSet::detect();
+    let operations = instructions.saturate(1) * ROUNDS;
     candidate("processor's limit", Some(operations), move || {
-        black_box(arch.dispatch(Chains));
+        let _ = black_box(instructions.saturate(ROUNDS));
     })
 }
 

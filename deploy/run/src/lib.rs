@@ -16,6 +16,7 @@ mod manifest;
 mod policies;
 mod policy_copy;
 mod processes;
+mod processor;
 mod progress;
 pub mod project;
 mod provenance;

@@ -7,6 +7,7 @@ use dmprl_shared::config::ExperimentConfig;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use crate::processor;
 use crate::random::random_u64;
 use crate::timestamp::rfc3339;
 
@@ -70,7 +71,7 @@ pub struct Packages {
 pub struct Machine {
     /// Operating system and architecture.
     pub os: String,
-    /// Name of the processor, if the system reports it.
+    /// Name and generation of the processor, if the system reports them.
     pub cpu: Option<String>,
     /// Number of cores that this process may use.
     pub cores: usize,
@@ -195,7 +196,7 @@ impl Machine {
             .and_then(|text| text.trim_end_matches("kB").trim().parse::<u64>().ok());
         Self {
             os: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
-            cpu: value(&read("/proc/cpuinfo"), "model name"),
+            cpu: processor::name(&read("/proc/cpuinfo")),
             cores: std::thread::available_parallelism().map_or(1, usize::from),
             memory_bytes: memory.map(|kib| kib * 1024),
         }

@@ -14,6 +14,8 @@ pub(super) const OURS: &str = "ours";
 pub(super) const LIBRARY: &str = "floor_library";
 /// Name of the matrix products with the learner's kernels.
 pub(super) const KERNELS: &str = "floor_kernels";
+/// Name of as many multiplications and additions as the products have, on registers.
+pub(super) const LIMIT: &str = "limit";
 /// Name of sampling a batch.
 pub(super) const SAMPLE: &str = "sample";
 /// Name of the optimiser and the target networks.
@@ -164,6 +166,8 @@ impl Figures {
             "floor": floor.trim_start_matches("floor_"),
             "floor_library_ms": self.ms(LIBRARY),
             "floor_kernels_ms": self.ms(KERNELS),
+            "limit_ms": self.ms(LIMIT),
+            "share_of_limit": self.ratio_to_ours(LIMIT),
             "ratio_to_floor": self.ratio(OURS, floor, |timed| timed.wall_s),
             "cpu_ratio_to_floor": self.ratio(OURS, floor, |timed| timed.cpu_s),
             "updates_per_s": updates_per_s,
@@ -222,6 +226,7 @@ pub(super) mod tests {
                 (OURS, 5.0),
                 (LIBRARY, 4.5),
                 (KERNELS, 4.0),
+                (LIMIT, 3.0),
                 (SAMPLE, 0.25),
                 (OPTIMISER, 0.5),
                 ("torch", 8.0),
@@ -243,6 +248,8 @@ pub(super) mod tests {
         close("ms_per_update", 10.0);
         close("floor_ms", 8.0);
         close("ratio_to_floor", 1.25);
+        close("limit_ms", 6.0);
+        close("share_of_limit", 0.6);
         close("cpu_ratio_to_floor", 1.25);
         close("updates_per_s", 100.0);
         close("samples_per_s", 25_600.0);

@@ -35,9 +35,9 @@ pub(super) use parts::timed;
 pub use peers::PeerKind;
 pub(super) use synthetic::fill;
 
-use figures::{KERNELS, LIBRARY, OPTIMISER, OURS, SAMPLE};
+use figures::{KERNELS, LIBRARY, LIMIT, OPTIMISER, OURS, SAMPLE};
 use floor::Engine;
-use parts::{FloorWork, OptimiserWork, SampleWork};
+use parts::{FloorWork, LimitWork, OptimiserWork, SampleWork};
 use peers::Peer;
 use products::Cycle;
 
@@ -117,6 +117,7 @@ fn measure(bench: &LearnerBench, progress: &dyn Progress) -> anyhow::Result<Figu
 /// The candidates that run in this process.
 struct OwnWork {
     floor: FloorWork,
+    limit: LimitWork,
     sample: SampleWork,
     optimiser: OptimiserWork,
 }
@@ -126,6 +127,7 @@ impl OwnWork {
         let cycle = Cycle::of(learner);
         Ok(Self {
             floor: FloorWork::new(learner, &cycle),
+            limit: LimitWork::new(learner, &cycle),
             sample: SampleWork::new(learner)?,
             optimiser: OptimiserWork::new(learner, &cycle),
         })
@@ -138,7 +140,7 @@ impl OwnWork {
         duration: Duration,
         figures: &mut Figures,
     ) -> anyhow::Result<()> {
-        let Self { floor, sample, optimiser } = self;
+        let Self { floor, limit, sample, optimiser } = self;
         // The update runs between the two floors, so that drift of the machine's speed affects
         // both alike.
         figures.add(LIBRARY, floor.measure(Engine::Library, duration)?);
@@ -146,6 +148,7 @@ impl OwnWork {
         figures.add(OURS, timed(duration, || Ok(learner.update()?))?);
         watch.check()?;
         figures.add(KERNELS, floor.measure(Engine::Kernels, duration)?);
+        figures.add(LIMIT, limit.measure(duration)?);
         // Short calls compared with an update: less time is enough.
         figures.add(SAMPLE, sample.measure(learner, duration / 4)?);
         figures.add(OPTIMISER, optimiser.measure(duration / 4)?);

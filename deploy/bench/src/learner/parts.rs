@@ -6,6 +6,7 @@ use anyhow::{bail, ensure};
 use dmprl_learner::algorithms::{Batch, BatchShape, SampleSource};
 use dmprl_learner::learner::Learner;
 use dmprl_learner::regime::Regime;
+use dmprl_learner::update::kernels::InstructionSet;
 use dmprl_learner::update::thread_pool::ThreadPool;
 use dmprl_shared::policy::Head;
 use rustix::time::{ClockId, clock_gettime};
@@ -81,6 +82,37 @@ impl FloorWork {
             Ok(())
         })?;
         Ok(cycle.over(*updates))
+    }
+}
+
+/// Multiplications and additions on registers, as many as all matrix products of an update have. No
+/// update is faster.
+pub(super) struct LimitWork {
+    pool: ThreadPool,
+    /// Rounds of each thread.
+    rounds: Vec<usize>,
+}
+
+impl LimitWork {
+    pub(super) fn new(learner: &Learner, cycle: &Cycle) -> Self {
+        let threads = learner.config().learner.threads;
+        let products = cycle.products.iter().map(|product| {
+            let Product { rows, inputs, outputs, .. } = product;
+            2 * rows * inputs * outputs
+        });
+        let update = products.sum::<usize>() / cycle.updates as usize;
+        let rounds = update / threads / InstructionSet::detect().saturate(1);
+        Self { pool: ThreadPool::new(threads), rounds: vec![rounds; threads] }
+    }
+
+    pub(super) fn measure(&mut self, duration: Duration) -> anyhow::Result<Timed> {
+        let instructions = InstructionSet::detect();
+        timed(duration, || {
+            self.pool.for_each(&mut self.rounds, |rounds| {
+                let _ = instructions.saturate(*rounds);
+            });
+            Ok(())
+        })
     }
 }
 

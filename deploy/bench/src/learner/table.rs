@@ -3,7 +3,7 @@
 use dmprl_run::format::grouped;
 use dmprl_shared::config::Device;
 
-use super::figures::{Figures, KERNELS, LIBRARY, OURS};
+use super::figures::{Figures, KERNELS, LIBRARY, LIMIT, OURS};
 use super::peers::PeerKind;
 use crate::statistics::{max, min};
 
@@ -28,7 +28,12 @@ impl Figures {
             String::new(),
             format!("  {:<15} {:>9} {:>9}   {:<19} ours", "", "ms/update", "CPU ms", "from … to"),
         ];
-        let rows = [(OURS, "ours"), (KERNELS, "floor, ours"), (LIBRARY, "floor, library")];
+        let rows = [
+            (OURS, "ours"),
+            (KERNELS, "floor, ours"),
+            (LIBRARY, "floor, library"),
+            (LIMIT, "processor limit"),
+        ];
         lines.extend(rows.iter().map(|(name, label)| self.row(name, label)));
         let peers = PeerKind::ALL.iter().map(|kind| kind.name());
         let requested = peers.filter(|name| self.notes.iter().any(|(noted, _)| noted == name));

@@ -20,6 +20,7 @@ mod backward;
 pub mod bf16;
 mod forward;
 mod layer_norm;
+mod limit;
 mod optimizer;
 mod pack;
 #[cfg(test)]
