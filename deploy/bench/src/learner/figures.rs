@@ -16,6 +16,8 @@ pub(super) const LIBRARY: &str = "floor_library";
 pub(super) const KERNELS: &str = "floor_kernels";
 /// Name of as many multiplications and additions as the products have, on registers.
 pub(super) const LIMIT: &str = "limit";
+/// Name of a cache line's way from one core to another.
+pub(super) const HANDOVER: &str = "handover";
 /// Name of sampling a batch.
 pub(super) const SAMPLE: &str = "sample";
 /// Name of the optimiser and the target networks.
@@ -167,6 +169,7 @@ impl Figures {
             "floor_library_ms": self.ms(LIBRARY),
             "floor_kernels_ms": self.ms(KERNELS),
             "limit_ms": self.ms(LIMIT),
+            "handover_ns": self.ms(HANDOVER).map(|ms| 1e6 * ms),
             "share_of_limit": self.ratio_to_ours(LIMIT),
             "ratio_to_floor": self.ratio(OURS, floor, |timed| timed.wall_s),
             "cpu_ratio_to_floor": self.ratio(OURS, floor, |timed| timed.cpu_s),

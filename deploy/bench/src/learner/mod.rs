@@ -35,9 +35,9 @@ pub(super) use parts::timed;
 pub use peers::PeerKind;
 pub(super) use synthetic::fill;
 
-use figures::{KERNELS, LIBRARY, LIMIT, OPTIMISER, OURS, SAMPLE};
+use figures::{HANDOVER, KERNELS, LIBRARY, LIMIT, OPTIMISER, OURS, SAMPLE};
 use floor::Engine;
-use parts::{FloorWork, LimitWork, OptimiserWork, SampleWork};
+use parts::{FloorWork, LimitWork, OptimiserWork, SampleWork, handover};
 use peers::Peer;
 use products::Cycle;
 
@@ -149,6 +149,9 @@ impl OwnWork {
         watch.check()?;
         figures.add(KERNELS, floor.measure(Engine::Kernels, duration)?);
         figures.add(LIMIT, limit.measure(duration)?);
+        if learner.config().learner.threads > 1 {
+            figures.add(HANDOVER, handover());
+        }
         // Short calls compared with an update: less time is enough.
         figures.add(SAMPLE, sample.measure(learner, duration / 4)?);
         figures.add(OPTIMISER, optimiser.measure(duration / 4)?);

@@ -1,5 +1,6 @@
 //! Measures parts of an update separately: matrix products, sampling, optimiser.
 
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{bail, ensure};
@@ -114,6 +115,44 @@ impl LimitWork {
             Ok(())
         })
     }
+}
+
+/// Round trips of a cache line between two readings of the clock.
+const ROUND_TRIPS: u32 = 200;
+/// Readings of the clock. The scheduler may interrupt some of them.
+const READINGS: usize = 101;
+
+/// Measures how long a cache line takes from one core to another. Threads exchange thousands of
+/// lines in an update. In a virtual machine this time changes with the cores that it runs on.
+pub(super) fn handover() -> Timed {
+    let line = AtomicU32::new(0);
+    let wait_for = |value| {
+        while line.load(Ordering::Acquire) != value {
+            std::hint::spin_loop();
+        }
+    };
+    let mut readings = std::thread::scope(|scope| {
+        scope.spawn(|| {
+            for trip in 0..ROUND_TRIPS * READINGS as u32 {
+                wait_for(2 * trip + 1);
+                line.store(2 * trip + 2, Ordering::Release);
+            }
+        });
+        let mut trip = 0;
+        let reading = |_| {
+            let (start, cpu) = (Instant::now(), cpu_s());
+            for _ in 0..ROUND_TRIPS {
+                line.store(2 * trip + 1, Ordering::Release);
+                wait_for(2 * trip + 2);
+                trip += 1;
+            }
+            let all = Timed { wall_s: start.elapsed().as_secs_f64(), cpu_s: cpu_s() - cpu };
+            all.over(f64::from(2 * ROUND_TRIPS))
+        };
+        (0..READINGS).map(reading).collect::<Vec<_>>()
+    });
+    readings.sort_by(|a, b| a.wall_s.total_cmp(&b.wall_s));
+    readings[READINGS / 2]
 }
 
 /// The sampling of a batch.

@@ -3,7 +3,7 @@
 use dmprl_run::format::grouped;
 use dmprl_shared::config::Device;
 
-use super::figures::{Figures, KERNELS, LIBRARY, LIMIT, OURS};
+use super::figures::{Figures, HANDOVER, KERNELS, LIBRARY, LIMIT, OURS};
 use super::peers::PeerKind;
 use crate::statistics::{max, min};
 
@@ -47,6 +47,9 @@ impl Figures {
         if let Some(shares) = self.shares() {
             let parts = shares.map(|(part, share)| format!("{part} {:.1} %", 100.0 * share));
             lines.push(format!("  share of time: {}", parts.join(", ")));
+        }
+        if let Some(ms) = self.ms(HANDOVER) {
+            lines.push(format!("  a cache line goes from core to core in {:.0} ns", 1e6 * ms));
         }
         if let Some(bytes) = self.peak_memory_bytes {
             lines.push(format!("  peak memory {:.0} MB, replay included", bytes as f64 / 1e6));

@@ -113,9 +113,6 @@ impl WithSimd for AdamPass<'_> {
                 let share = simd.splat_f32s(polyak);
                 let (target, target_tail) = S::as_mut_simd_f32s(target);
                 for ((p, ((m, v), g)), target) in numbers.zip(target) {
-                    for at in [p as *const S::f32s, target as *const S::f32s] {
-                        prefetch_to_write(at.wrapping_add(AHEAD).cast());
-                    }
                     rule.step(simd, p, m, v, *g);
                     *target = polyak_average(simd, *target, *p, share);
                 }
@@ -168,21 +165,4 @@ impl<S: Simd> Rule<S> {
         let root = simd.add_f32s(simd.sqrt_f32s(*v), self.epsilon);
         *p = simd.mul_add_e_f32s(self.step, simd.div_f32s(*m, root), *p);
     }
-}
-
-/// Vectors between a step and the ones that are prefetched for it.
-const AHEAD: usize = 16;
-
-/// Fetches a cache line that is to be written. The other threads have read the parameters, so a
-/// store alone would wait until they have given up the line. Any address is allowed.
-#[inline(always)]
-fn prefetch_to_write(at: *const f32) {
-    #[cfg(target_arch = "x86_64")]
-    // SAFETY: prefetching an invalid address has no effect, and processors without this instruction
-    // do nothing.
-    unsafe {
-        std::arch::asm!("prefetchw [{}]", in(reg) at, options(nostack, preserves_flags, readonly));
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = at;
 }
