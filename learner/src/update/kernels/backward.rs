@@ -3,7 +3,7 @@
 use pulp::{Simd, WithSimd};
 
 use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
-use super::{InstructionSet, PANEL};
+use super::{InstructionSet, PANEL, with_scratch};
 
 /// The product gradient * weights for the rows of a shard, from column `first` of the inputs on.
 #[derive(Debug)]
@@ -39,7 +39,9 @@ impl Backward<'_> {
         assert_eq!(self.inputs_gradient.len(), rows * width, "gradient of the inputs");
         let activations = self.activations.map_or(rows * width, <[f32]>::len);
         assert_eq!(activations, rows * width, "activations");
-        instructions.run(Job { layer: self, rows, width, inputs_len, column: 0 });
+        with_scratch(depth * PANEL, |panel| {
+            instructions.run(Job { layer: self, rows, width, inputs_len, column: 0, panel });
+        });
     }
 }
 
@@ -50,6 +52,26 @@ struct Job<'a> {
     inputs_len: usize,
     /// First column of the current panel, relative to `first`.
     column: usize,
+    /// The weights of the current panel, (outputs, [`PANEL`]), padded with zeros. In place, rows of
+    /// wide layers would compete for the same few lines of the caches.
+    panel: &'a mut [f32],
+}
+
+impl Job<'_> {
+    fn fill_panel(&mut self) {
+        let width = PANEL.min(self.width - self.column);
+        let columns = self.layer.first + self.column..self.layer.first + self.column + width;
+        let rows = self.layer.weights.chunks_exact(self.inputs_len);
+        for (row, panel) in rows.zip(self.panel.chunks_exact_mut(PANEL)) {
+            match <&[f32; PANEL]>::try_from(&row[columns.clone()]) {
+                Ok(whole) => panel.copy_from_slice(whole),
+                Err(_) => {
+                    panel[..width].copy_from_slice(&row[columns.clone()]);
+                    panel[width..].fill(0.0);
+                }
+            }
+        }
+    }
 }
 
 impl WithSimd for Job<'_> {
@@ -58,6 +80,7 @@ impl WithSimd for Job<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         while self.column < self.width {
+            self.fill_panel();
             for_rows(simd, 0..self.rows, &mut self);
             self.column += PANEL;
         }
@@ -75,18 +98,8 @@ impl<S: Simd> Tiled<S> for Job<'_> {
             row_stride: depth,
             depth_stride: 1,
         };
-        let right = Wide {
-            data: &self.layer.weights[self.layer.first + self.column..],
-            stride: self.inputs_len,
-            width: end - self.column,
-            next: Some(PANEL),
-        };
-        let sums = [[zero; V]; M];
-        let sums = if right.width == PANEL {
-            accumulate::<S, M, V, false>(simd, sums, left, right, depth)
-        } else {
-            accumulate::<S, M, V, true>(simd, sums, left, right, depth)
-        };
+        let right = Wide { data: self.panel, stride: PANEL, width: PANEL, next: None };
+        let sums = accumulate::<S, M, V, false>(simd, [[zero; V]; M], left, right, depth);
         for (m, mut sums) in sums.into_iter().enumerate() {
             let at = (row + m) * self.width;
             let columns = at + self.column..at + end;

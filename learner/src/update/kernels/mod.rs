@@ -37,6 +37,8 @@ pub(crate) use optimizer::{BETA1, BETA2, EPSILON};
 pub use pack::{pack, packed_len};
 pub use weight_gradient::{GradientShard, WeightGradient};
 
+use std::cell::RefCell;
+
 use pulp::{Arch, WithSimd};
 
 /// Outputs of a layer in one packed panel, and the width of every tile.
@@ -85,4 +87,17 @@ impl InstructionSet {
     fn run<W: WithSimd>(self, work: W) -> W::Output {
         self.0.dispatch(work)
     }
+}
+
+/// Calls `f` with `len` numbers of any value, which the thread keeps for the next call.
+fn with_scratch<T>(len: usize, f: impl FnOnce(&mut [f32]) -> T) -> T {
+    thread_local! {
+        static SCRATCH: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+    }
+    SCRATCH.with_borrow_mut(|scratch| {
+        if scratch.len() < len {
+            scratch.resize(len, 0.0);
+        }
+        f(&mut scratch[..len])
+    })
 }

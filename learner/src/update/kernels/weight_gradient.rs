@@ -5,7 +5,7 @@ use std::ops::Range;
 use pulp::{Simd, WithSimd};
 
 use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
-use super::{InstructionSet, PANEL};
+use super::{InstructionSet, PANEL, with_scratch};
 
 /// Shards that a tile sums before it stores the result. They are collected first, because calling
 /// an iterator in the middle of a tile would spill the tile's registers.
@@ -65,15 +65,19 @@ impl<'b, I: Iterator<Item = GradientShard<'b>>> WeightGradient<'_, I> {
             if len == 0 && accumulate_onto {
                 return;
             }
-            instructions.run(Job {
-                shards: &group[..len],
-                inputs_len,
-                outputs_len,
-                outputs: outputs.clone(),
-                weights: &mut *weights,
-                bias: &mut *bias,
-                accumulate_onto,
-                column: 0,
+            let rows = group.iter().map(|shard| shard.gradient.len() / outputs_len).sum::<usize>();
+            with_scratch(rows * PANEL, |gradient| {
+                instructions.run(Job {
+                    shards: &group[..len],
+                    inputs_len,
+                    outputs_len,
+                    outputs: outputs.clone(),
+                    weights: &mut *weights,
+                    bias: &mut *bias,
+                    accumulate_onto,
+                    column: 0,
+                    gradient,
+                });
             });
             accumulate_onto = true;
         }
@@ -92,6 +96,9 @@ struct Job<'a> {
     accumulate_onto: bool,
     /// First column of the current panel.
     column: usize,
+    /// The gradient of the current outputs, (rows of all shards, [`PANEL`]). In place, rows of wide
+    /// layers would compete for the same few lines of the caches.
+    gradient: &'a mut [f32],
 }
 
 impl WithSimd for Job<'_> {
@@ -103,6 +110,7 @@ impl WithSimd for Job<'_> {
         let outputs = self.outputs.clone();
         // Row by row of tiles, so that a tile's rows of the gradient are still in the cache.
         for first in outputs.clone().step_by(PANEL) {
+            self.fill_gradient(first..outputs.end.min(first + PANEL));
             self.column = 0;
             while self.column < self.inputs_len {
                 for_rows(simd, first..outputs.end.min(first + PANEL), &mut self);
@@ -113,6 +121,16 @@ impl WithSimd for Job<'_> {
 }
 
 impl Job<'_> {
+    fn fill_gradient(&mut self, outputs: Range<usize>) {
+        let rows = self.shards.iter().flat_map(|s| s.gradient.chunks_exact(self.outputs_len));
+        for (row, copy) in rows.zip(self.gradient.chunks_exact_mut(PANEL)) {
+            match <&[f32; PANEL]>::try_from(&row[outputs.clone()]) {
+                Ok(whole) => copy.copy_from_slice(whole),
+                Err(_) => copy[..outputs.len()].copy_from_slice(&row[outputs.clone()]),
+            }
+        }
+    }
+
     #[inline(always)]
     fn bias<S: Simd>(&mut self, simd: S) {
         // Whole vectors of columns first, then the remaining columns one by one.
@@ -154,13 +172,13 @@ impl<S: Simd> Tiled<S> for Job<'_> {
                 *sums = load::<S, V>(simd, &self.weights[columns(m)]);
             }
         }
+        let mut gradient = &self.gradient[(row - self.outputs.start) % PANEL..];
         for shard in self.shards {
             let rows = shard.gradient.len() / outputs_len;
             if rows == 0 {
                 continue;
             }
-            let gradient = &shard.gradient[row..];
-            let left = Broadcast { data: gradient, row_stride: 1, depth_stride: outputs_len };
+            let left = Broadcast { data: gradient, row_stride: 1, depth_stride: PANEL };
             let inputs = &shard.inputs[self.column..];
             let right = Wide { data: inputs, stride: inputs_len, width, next: Some(PANEL) };
             sums = if width == PANEL {
@@ -168,6 +186,7 @@ impl<S: Simd> Tiled<S> for Job<'_> {
             } else {
                 accumulate::<S, M, V, true>(simd, sums, left, right, rows)
             };
+            gradient = gradient.get(rows * PANEL..).unwrap_or_default();
         }
         for (m, sums) in sums.into_iter().enumerate() {
             store::<S, V>(simd, &mut self.weights[columns(m)], sums);
