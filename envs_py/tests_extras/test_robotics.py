@@ -4,10 +4,12 @@ import subprocess
 import sys
 import unittest
 
+import gymnasium
 import numpy as np
 
 from dmprl.env_options import NO_OPTIONS, EnvOptions, Randomise
 from dmprl.goal_rule import proven
+from dmprl.robotics_repair import RobotReader
 from dmprl.segment_env import GoalRows, SegmentBuffers, make
 
 
@@ -46,6 +48,26 @@ class FetchTest(unittest.TestCase):
         np.testing.assert_array_equal(moved[:, 3:6], 0.0)
         env.step_segment(np.zeros((2, 5, 4)), out)
         self.assertFalse(out.failed.any())
+
+    def test_joints_found_once_have_the_values_that_gymnasium_robotics_finds_by_name(self):
+        from gymnasium_robotics.utils import mujoco_utils
+
+        started("FetchPush-v4", 1, 5)
+        reader = mujoco_utils.robot_get_obs
+        self.assertIsInstance(reader, RobotReader)
+        for task_id in ("FetchPush-v4", "HandReach-v3"):
+            env = gymnasium.make(task_id).unwrapped
+            env.reset(seed=3)
+            env.step(env.action_space.sample())
+            names = env._model_names.joint_names
+            found = reader(env.model, env.data, names)
+            by_name = reader._original(env.model, env.data, names)
+            self.assertGreater(found[0].size, 10, task_id)
+            for got, want in zip(found, by_name, strict=True):
+                np.testing.assert_array_equal(got, want)
+        # One joint is a number there.
+        names = [name for name in names if name.startswith("robot")][:1]
+        self.assertEqual(reader(env.model, env.data, names)[0].shape, ())
 
     def test_straight_to_the_goal_succeeds(self):
         env, out = started("FetchReachDense-v4", 4, 5)
