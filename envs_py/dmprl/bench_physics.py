@@ -78,7 +78,7 @@ class BatchPeer:
         return self._env_steps
 
 
-class Physics(BatchPeer):
+class Ceiling(BatchPeer):
     """Runs physics with the worker's model and process settings.
 
     No worker can be faster; the difference is the overhead of the worker.
@@ -89,7 +89,7 @@ class Physics(BatchPeer):
         self.about = "mujoco.batch with the worker's model and settings"
 
 
-class Ceiling(BatchPeer):
+class PlainMujoco(BatchPeer):
     """Runs physics with MuJoCo's default settings, on Gymnasium's model file if there is one."""
 
     def __init__(self, plan: dict, seed: int) -> None:

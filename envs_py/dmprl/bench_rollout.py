@@ -20,14 +20,14 @@ from pathlib import Path
 
 from dmprl import python_path
 from dmprl.bench_peers import AbsentError, EnvPoolLoop, GymnasiumLoop, PandaGymLoop
-from dmprl.bench_physics import Ceiling, Physics
+from dmprl.bench_physics import Ceiling, PlainMujoco
 
 SETTLE_S = 0.1
 """Warm-up time before the measurement, for caches and clock frequency [s]."""
 
 KINDS = {
+    "mujoco": PlainMujoco,
     "ceiling": Ceiling,
-    "physics": Physics,
     "gymnasium": GymnasiumLoop,
     "envpool": EnvPoolLoop,
     "panda_gym": PandaGymLoop,

@@ -17,7 +17,7 @@ from dmprl.bench_peers import (
     flat,
     gymnasium_env,
 )
-from dmprl.bench_physics import Ceiling, Physics
+from dmprl.bench_physics import Ceiling, PlainMujoco
 from dmprl.bench_rollout import run_for
 from dmprl.numpy_policy import Noise
 from dmprl.segment_env import SegmentBuffers, make
@@ -53,18 +53,18 @@ class PeerTest(unittest.TestCase):
             with self.assertRaisesRegex(AbsentError, task_id):
                 envpool_id(task_id, known)
 
-    def test_physics_runs_whole_segments(self):
-        for kind in (Ceiling, Physics):
+    def test_simulations_run_whole_segments(self):
+        for kind in (PlainMujoco, Ceiling):
             peer = kind(plan("Reacher-v5"), seed=1)
             self.assertEqual([peer.segment() for _ in range(12)], [15] * 12)
 
-    def test_physics_runs_segments_longer_than_an_episode(self):
-        peer = Physics({**plan("Reacher-v5"), "decision_steps": 60}, seed=1)
+    def test_the_ceiling_runs_segments_longer_than_an_episode(self):
+        peer = Ceiling({**plan("Reacher-v5"), "decision_steps": 60}, seed=1)
         self.assertEqual([peer.segment() for _ in range(2)], [180] * 2)
 
-    def test_physics_repeats_the_episode_of_the_workers_environments(self):
+    def test_the_ceiling_repeats_the_episode_of_the_workers_environments(self):
         for task_id, action_len in (("Pusher-v5", 7), ("dmprl/PandaReach-v0", 3)):
-            peer, env = Physics(plan(task_id, action_len), seed=3), make(task_id, 3, 5)
+            peer, env = Ceiling(plan(task_id, action_len), seed=3), make(task_id, 3, 5)
             spec = env.spec()
             out = SegmentBuffers(3, 5, spec["observation_len"], spec["action_len"])
             env.reset(np.ones(3, np.uint8), np.arange(3, 6, dtype=np.uint64), out)
@@ -74,8 +74,8 @@ class PeerTest(unittest.TestCase):
                 peer.segment()
             np.testing.assert_array_equal(peer._batch.qpos, env.batch.qpos)
 
-    def test_the_ceiling_repeats_the_episode_of_gymnasium(self):
-        peer = Ceiling(plan("Reacher-v5"), seed=3)
+    def test_plain_mujoco_repeats_the_episode_of_gymnasium(self):
+        peer = PlainMujoco(plan("Reacher-v5"), seed=3)
         env = gymnasium.make("Reacher-v5").unwrapped
         env.reset(seed=5)
         for _ in range(2):
@@ -87,8 +87,8 @@ class PeerTest(unittest.TestCase):
 
     def test_an_unavailable_peer_has_a_reason(self):
         for peer, task_id in (
-            (Ceiling, "CartPole-v1"),
-            (Physics, "Pendulum-v1"),
+            (PlainMujoco, "CartPole-v1"),
+            (Ceiling, "Pendulum-v1"),
             (GymnasiumLoop, "Nothing-v0"),
             (GymnasiumLoop, "nowhere:Arm"),
             (GymnasiumLoop, "tiny_envs:Batch"),

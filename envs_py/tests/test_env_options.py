@@ -12,7 +12,7 @@ import numpy as np
 import dmprl
 from dmprl import recording
 from dmprl.bench_peers import AbsentError, EnvPoolLoop, gymnasium_env
-from dmprl.bench_physics import Ceiling, Physics
+from dmprl.bench_physics import Ceiling, PlainMujoco
 from dmprl.env_options import NO_OPTIONS, EnvOptions, OptionsError
 from dmprl.play import Shown
 from dmprl.program import flags
@@ -183,7 +183,7 @@ class ReadersTest(unittest.TestCase):
         env.reset(seed=1)
         self.assertEqual(env.step(np.ones(1))[1], 2.0)
         self.assertTrue(env.step(np.ones(1))[2])
-        for peer in (EnvPoolLoop, Physics, Ceiling):
+        for peer in (EnvPoolLoop, Ceiling, PlainMujoco):
             with self.assertRaises(AbsentError):
                 peer(plan, 1)
 

@@ -17,9 +17,9 @@ pub(super) const WORKER: &str = "worker";
 pub(super) const ONE_WORKER: &str = "one_worker";
 /// All candidates, in the order of the report.
 pub(super) const NAMES: [&str; 7] =
-    ["ceiling", "physics", WORKER, ONE_WORKER, "gymnasium", "envpool", PANDA_GYM];
+    ["mujoco", "ceiling", WORKER, ONE_WORKER, "gymnasium", "envpool", PANDA_GYM];
 /// The candidates with which the worker is compared.
-const COMPARED: [&str; 6] = ["ceiling", "physics", ONE_WORKER, "gymnasium", "envpool", PANDA_GYM];
+const COMPARED: [&str; 6] = ["mujoco", "ceiling", ONE_WORKER, "gymnasium", "envpool", PANDA_GYM];
 
 /// Environment steps per second of each candidate and round, with further figures.
 #[derive(Debug, Clone)]

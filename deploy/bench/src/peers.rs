@@ -22,9 +22,9 @@ const MEASURE_SLACK: Duration = Duration::from_secs(60);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum PeerKind {
     /// `mujoco.batch` alone, as imported, on the model file that Gymnasium ships.
+    Mujoco,
+    /// `mujoco.batch` alone, with the worker's own model and process settings. No worker is faster.
     Ceiling,
-    /// `mujoco.batch` alone, with the worker's own model and process settings.
-    Physics,
     /// A plain Gymnasium loop with the policy in NumPy.
     Gymnasium,
     /// EnvPool with the policy in NumPy.
@@ -44,16 +44,16 @@ pub(super) fn is_in_panda_gym(env_id: &str) -> bool {
 }
 
 impl PeerKind {
-    /// All peers, in the order of a round. The workers' upper bounds (`Ceiling`, `Physics`) come
+    /// All peers, in the order of a round. The workers' upper bounds (`Mujoco`, `Ceiling`) come
     /// last, right before the workers, so that drift of the machine's speed affects both alike.
     pub(super) const ALL: [Self; 5] =
-        [Self::PandaGym, Self::EnvPool, Self::Gymnasium, Self::Ceiling, Self::Physics];
+        [Self::PandaGym, Self::EnvPool, Self::Gymnasium, Self::Mujoco, Self::Ceiling];
 
     /// Name of the peer in `dmprl.bench_rollout`.
     pub(super) fn name(self) -> &'static str {
         match self {
+            Self::Mujoco => "mujoco",
             Self::Ceiling => "ceiling",
-            Self::Physics => "physics",
             Self::Gymnasium => "gymnasium",
             Self::EnvPool => "envpool",
             Self::PandaGym => PANDA_GYM,

@@ -37,7 +37,7 @@ fn a_task_on_the_batch_is_measured_beside_its_ceiling_and_gymnasium() {
     let running = bench(&place, "reacher", &["--workers", "2", "--rounds", "2", "--json"]);
     let id = running.id();
     let json = running.wait().with_status(0).json();
-    for key in ["ceiling", "physics", "worker", "one_worker", "gymnasium"] {
+    for key in ["mujoco", "ceiling", "worker", "one_worker", "gymnasium"] {
         positive(&json, &format!("{key}_steps_per_s"));
         assert_eq!(json["rounds"][key].as_array().unwrap().len(), 2, "{json}");
         assert!(json["cpu_us_per_step"][key].as_f64() > Some(0.0), "{json}");
@@ -66,7 +66,7 @@ fn a_task_without_a_batch_has_no_ceiling_and_a_gaussian_mlp_is_measured_too() {
         let mut rows = finished.printed.lines().map(str::trim_start);
         rows.find(|row| row.starts_with(name)).unwrap_or_else(|| panic!("{}", finished.printed))
     };
-    assert!(row("ceiling").ends_with("absent") && row("physics").ends_with("absent"));
+    assert!(row("mujoco").ends_with("absent") && row("ceiling").ends_with("absent"));
     assert!(row("gymnasium").ends_with('×') && row("worker").contains('…'));
     assert!(finished.printed.contains("0 segments rejected, 0 lost"), "{}", finished.printed);
     assert!(finished.printed.contains("Pendulum-v1 does not run on mujoco.batch"));
@@ -82,7 +82,7 @@ fn a_segment_env_of_ones_own_is_measured_alone() {
         bench(&place, "tiny_envs:Timed", &[&more[..], &[folder.to_str().unwrap()]].concat());
     let json = running.wait().with_status(0).json();
     positive(&json, "worker_steps_per_s");
-    for absent in ["physics", "ceiling", "gymnasium", "envpool", "panda_gym"] {
+    for absent in ["mujoco", "ceiling", "gymnasium", "envpool", "panda_gym"] {
         assert!(json[format!("{absent}_steps_per_s")].is_null(), "{json}");
         assert!(json["notes"][absent].is_string(), "{json}");
     }

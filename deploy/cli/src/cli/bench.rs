@@ -37,8 +37,8 @@ EXAMPLES
 
 const ROLLOUT_HELP: &str = "\
 In every round each of these runs once for --seconds while the others sleep; the median counts.
-  ceiling    mujoco.batch alone, as imported, on Gymnasium's model file if there is one
-  physics    mujoco.batch alone, with the workers' own model and process settings
+  mujoco     mujoco.batch alone, as imported, on Gymnasium's model file if there is one
+  ceiling    mujoco.batch alone, with the workers' own model and process settings: the bound
              (both replay recorded controls, see --controls)
   worker     `dmprl actor` processes as in a run: network, movement primitives, noise,
              environments, shared memory; this process receives the segments instead of a learner.
