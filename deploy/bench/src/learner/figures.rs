@@ -44,6 +44,9 @@ impl Timed {
 pub struct Figures {
     pub(super) config: ExperimentConfig,
     pub(super) seconds: f64,
+    observation_len: usize,
+    /// Steps in the replay.
+    pub(super) replay_steps: usize,
     machine: Option<Machine>,
     /// Name, memory and driver of the GPUs, if the update runs on one.
     gpu: Option<String>,
@@ -61,6 +64,8 @@ impl Figures {
         Self {
             config: bench.config.clone(),
             seconds: bench.duration.as_secs_f64(),
+            observation_len: bench.spec.observation_len,
+            replay_steps: 0,
             machine: Manifest::new(None).ok().map(|manifest| manifest.machine),
             gpu: (bench.config.learner.device == Device::Cuda).then(gpus).flatten(),
             load_average: load_average(),
@@ -176,6 +181,8 @@ impl Figures {
             "updates_per_s": updates_per_s,
             "samples_per_s": updates_per_s.map(|rate| rate * batch_size as f64),
             "batch_size": batch_size,
+            "observation_len": self.observation_len,
+            "replay_steps": self.replay_steps,
             "threads": self.config.learner.threads,
             "device": self.config.learner.device,
             "gpu": self.gpu,
@@ -214,6 +221,8 @@ pub(super) mod tests {
         let mut figures = Figures {
             config,
             seconds: 0.4,
+            observation_len: 10,
+            replay_steps: 1_000,
             machine: None,
             gpu: None,
             load_average: None,

@@ -33,7 +33,7 @@ pub use figures::Figures;
 pub(super) use figures::Timed;
 pub(super) use parts::timed;
 pub use peers::PeerKind;
-pub(super) use synthetic::fill;
+pub(super) use synthetic::{STEPS, fill};
 
 use figures::{HANDOVER, KERNELS, LIBRARY, LIMIT, OPTIMISER, OURS, SAMPLE};
 use floor::Engine;
@@ -47,6 +47,8 @@ pub struct LearnerBench {
     pub config: ExperimentConfig,
     /// Spec of the task's environment.
     pub spec: EnvSpec,
+    /// Steps in the replay, unless it is smaller.
+    pub replay_steps: usize,
     /// Peers that do the same update.
     pub peers: Vec<PeerKind>,
     /// Python interpreter of the peers.
@@ -87,7 +89,8 @@ fn measure(bench: &LearnerBench, progress: &dyn Progress) -> anyhow::Result<Figu
         }
     }
     let mut learner = Learner::new(bench.config.clone(), &bench.spec, synthetic::RUN_ID)?;
-    synthetic::fill(&mut learner, &bench.spec)?;
+    fill(&mut learner, &bench.spec, bench.replay_steps)?;
+    figures.replay_steps = learner.replay.len() * learner.policy().layout().segment_steps;
     watch.check()?;
     timed(bench.duration, || Ok(learner.update()?))?;
     // Measured before the benchmark allocates its own buffers.

@@ -8,17 +8,17 @@ use dmprl_shared::spec::EnvSpec;
 /// Run id in the synthetic segments.
 pub(super) const RUN_ID: u64 = 1;
 
-/// Number of steps to insert: enough that batches do not come from the processor's caches.
-const STEPS: usize = 100_000;
+/// Number of steps that are enough for batches not to come from the processor's caches.
+pub(crate) const STEPS: usize = 100_000;
 
 /// Phase step between two values. The sine never repeats, because 0.37 / 2 pi is irrational.
 const STRIDE: f32 = 0.37;
 
-/// Inserts complete episodes, one after the other.
-pub(crate) fn fill(learner: &mut Learner, spec: &EnvSpec) -> anyhow::Result<()> {
+/// Inserts complete episodes, one after the other, until the replay has `steps` or is full.
+pub(crate) fn fill(learner: &mut Learner, spec: &EnvSpec, steps: usize) -> anyhow::Result<()> {
     let layout = learner.policy().layout();
     let mut segment = Segment::zeroed(layout);
-    let steps = STEPS.min(learner.config().replay.capacity_steps);
+    let steps = steps.min(learner.config().replay.capacity_steps);
     let (mut done, mut numbers, mut sequence, mut episode) = (0, 0, 0, 0);
     while done < steps {
         let mut episode_step = 0;

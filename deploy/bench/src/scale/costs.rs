@@ -12,7 +12,7 @@ use dmprl_shared::spec::EnvSpec;
 use dmprl_shared::transport::delivery::{LogIdentity, SegmentLog};
 
 use super::feed::FeedPlan;
-use crate::learner::{Timed, fill, timed};
+use crate::learner::{STEPS, Timed, fill, timed};
 use crate::statistics::median;
 use crate::synthetic_segments::{RUN_ID, SyntheticSegments};
 use crate::workers::{BenchRun, Workers};
@@ -162,7 +162,7 @@ pub(super) fn update(
     config.actors.joined_max = 0;
     let threads = config.learner.threads;
     let mut learner = Learner::new(config, spec, RUN_ID)?;
-    fill(&mut learner, spec)?;
+    fill(&mut learner, spec, STEPS)?;
     let mut least = Timed { wall_s: f64::INFINITY, cpu_s: f64::INFINITY };
     for _ in 0..ROUNDS {
         watch.check()?;

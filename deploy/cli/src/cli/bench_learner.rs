@@ -37,6 +37,7 @@ EXAMPLES
   dmprl bench learner --algo td3 --policy mlp --task reacher --threads 2 --json
   dmprl bench learner --task pusher --peer torch --peer jax --peer-python /opt/torch/bin/python
   dmprl bench learner --task pusher --set algorithm.batch_size=512 --rounds 9
+  dmprl bench learner --task pusher --observation-len 1000
   dmprl bench learner --task pusher --device cuda --set algorithm.batch_size=4096 --json";
 
 /// Arguments of `dmprl bench learner`.
@@ -54,6 +55,13 @@ pub(super) struct LearnerArgs {
     /// Threads of the update and of the peers.
     #[arg(long, value_name = "N")]
     threads: Option<u32>,
+    /// Numbers in an observation [default: the task's].
+    #[arg(long, value_name = "O", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    observation_len: Option<u32>,
+    /// Steps in the replay, unless `replay.capacity_steps` is less.
+    #[arg(long, value_name = "N", default_value_t = 100_000,
+          value_parser = clap::value_parser!(u32).range(1_000..))]
+    replay_steps: u32,
     /// Also measure the update in this library; repeatable.
     #[arg(long, value_enum)]
     peer: Vec<PeerKind>,
@@ -110,9 +118,15 @@ pub(super) fn run(args: &LearnerArgs) -> anyhow::Result<Outcome> {
     peers.dedup();
     let peer_python = args.peer_python.as_deref().map(interpreter).transpose()?;
     let root = dmprl_run::project::root()?;
+    let mut spec = task.spec();
+    if let Some(len) = args.observation_len {
+        spec.observation_len = len as usize;
+        spec.observation_names.clear();
+    }
     let bench = LearnerBench {
         config,
-        spec: task.spec(),
+        spec,
+        replay_steps: args.replay_steps as usize,
         peers,
         peer_python: peer_python.unwrap_or_else(|| root.join(".venv/bin/python")),
         peers_path: root.join("tests/peers"),
