@@ -1,4 +1,4 @@
-//! What the processor can do at most, for comparisons.
+//! The highest rate of the processor, for comparisons.
 
 use std::hint::black_box;
 
