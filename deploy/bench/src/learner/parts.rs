@@ -121,38 +121,48 @@ impl LimitWork {
 const ROUND_TRIPS: u32 = 200;
 /// Readings of the clock. The scheduler may interrupt some of them.
 const READINGS: usize = 101;
+/// Time limit of all readings. Without a free core, each way of the line takes a time slice.
+const HANDOVER_MAX: Duration = Duration::from_millis(200);
+/// Value of the line that ends the other thread.
+const END: u32 = u32::MAX;
 
 /// Measures how long a cache line takes from one core to another. Threads exchange thousands of
 /// lines in an update. In a virtual machine this time changes with the cores that it runs on.
 pub(super) fn handover() -> Timed {
     let line = AtomicU32::new(0);
-    let wait_for = |value| {
-        while line.load(Ordering::Acquire) != value {
-            std::hint::spin_loop();
-        }
-    };
-    let mut readings = std::thread::scope(|scope| {
+    let start = Instant::now();
+    let mut readings = Vec::with_capacity(READINGS);
+    std::thread::scope(|scope| {
         scope.spawn(|| {
-            for trip in 0..ROUND_TRIPS * READINGS as u32 {
-                wait_for(2 * trip + 1);
-                line.store(2 * trip + 2, Ordering::Release);
+            let mut awaited = 1;
+            loop {
+                match line.load(Ordering::Acquire) {
+                    END => break,
+                    value if value == awaited => {
+                        line.store(value + 1, Ordering::Release);
+                        awaited += 2;
+                    }
+                    _ => std::hint::spin_loop(),
+                }
             }
         });
-        let mut trip = 0;
-        let reading = |_| {
+        let mut sent = 1;
+        while readings.len() < READINGS && (readings.is_empty() || start.elapsed() < HANDOVER_MAX) {
             let (start, cpu) = (Instant::now(), cpu_s());
             for _ in 0..ROUND_TRIPS {
-                line.store(2 * trip + 1, Ordering::Release);
-                wait_for(2 * trip + 2);
-                trip += 1;
+                line.store(sent, Ordering::Release);
+                while line.load(Ordering::Acquire) != sent + 1 {
+                    std::hint::spin_loop();
+                }
+                sent += 2;
             }
             let all = Timed { wall_s: start.elapsed().as_secs_f64(), cpu_s: cpu_s() - cpu };
-            all.over(f64::from(2 * ROUND_TRIPS))
-        };
-        (0..READINGS).map(reading).collect::<Vec<_>>()
+            readings.push(all.over(f64::from(2 * ROUND_TRIPS)));
+        }
+        line.store(END, Ordering::Release);
     });
     readings.sort_by(|a, b| a.wall_s.total_cmp(&b.wall_s));
-    readings[READINGS / 2]
+    readings[readings.len() / 2]
 }
 
 /// The sampling of a batch.

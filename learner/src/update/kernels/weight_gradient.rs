@@ -107,6 +107,9 @@ impl WithSimd for Job<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         self.bias(simd);
+        if self.inputs_len == 0 {
+            return;
+        }
         let outputs = self.outputs.clone();
         // Row by row of tiles, so that a tile's rows of the gradient are still in the cache.
         for first in outputs.clone().step_by(PANEL) {
