@@ -117,9 +117,10 @@ impl Golden {
     }
 
     /// Runs all updates by kernels or graphs and compares them with the file.
-    fn check(mut self, backend: Backend) {
+    fn check(mut self, backend: Backend, device: config::Device) {
         let mut config = self.config();
         config.learner.backend = backend;
+        config.learner.device = device;
         let policy = Policy::new(config.policy_description(&spec())).unwrap();
         let mut algorithm = Algorithm::new(&config, &policy, None).unwrap();
         assert_eq!(algorithm.replica.is_some(), config.updates_by_graph());
@@ -233,9 +234,12 @@ fn every_update_equals_that_of_an_independent_implementation() {
     for file in &files {
         let golden = Golden::read(file);
         if !golden.config().algorithm.name.is_graph_only() {
-            golden.check(Backend::Kernels);
+            golden.check(Backend::Kernels, config::Device::Cpu);
         }
-        Golden::read(file).check(Backend::Graph);
+        Golden::read(file).check(Backend::Graph, config::Device::Cpu);
+        if cfg!(feature = "cuda") {
+            Golden::read(file).check(Backend::Graph, config::Device::Cuda);
+        }
     }
 }
 

@@ -1,6 +1,8 @@
 //! Compares the hand-derived updates with candle's automatic differentiation of the same losses,
 //! which uses none of our kernels.
 
+use std::iter;
+
 use dmprl_shared::config::Layers;
 use rand::RngExt;
 
@@ -70,23 +72,42 @@ fn case_with(keys: &[(&str, &str)], rule: Option<GoalRule>) -> Case {
     Case { config, rule, policy, algorithm, batch }
 }
 
-impl Case {
-    /// Compares one update by our kernels with one by candle's graph from the same state.
-    pub(super) fn check(&mut self, what: &str) {
-        let (shape, networks) = (self.algorithm.batch_shape(), self.algorithm.networks());
-        let device = &Device::Cpu;
-        let mut graph = Graph::new(&self.config, &self.policy, shape, device, &networks).unwrap();
-        let expected_losses = graph.update(&self.policy, &self.batch, 1).unwrap();
-        let mut reference = Algorithm::new(&self.config, &self.policy, self.rule.as_ref()).unwrap();
-        reference.for_each_network(|name, network| graph.fetch(name, network)).unwrap();
+/// The devices of graphs here: candle's CPU and, in a build with the feature `cuda`, the GPU that
+/// such a build is tested on.
+pub(super) fn devices() -> Vec<Device> {
+    let gpu = cfg!(feature = "cuda").then(|| Device::new_cuda(0).unwrap());
+    iter::once(Device::Cpu).chain(gpu).collect()
+}
 
+impl Case {
+    /// Compares one update by our kernels with one by candle's graph on each device, from the same
+    /// state.
+    pub(super) fn check(&mut self, what: &str) {
+        let expected: Vec<_> = devices().iter().map(|device| self.update_graph(device)).collect();
         let losses = self.algorithm.update(&self.policy, &self.batch, 1).unwrap();
+        for (device, (expected_losses, reference)) in devices().iter().zip(expected) {
+            let what = format!("{what}, {:?}", device.location());
+            self.compare(losses, expected_losses, &reference, &what);
+        }
+    }
+
+    /// Returns losses and networks after one update by candle's graph.
+    fn update_graph(&self, device: &Device) -> (Losses, Algorithm) {
+        let (shape, networks) = (self.algorithm.batch_shape(), self.algorithm.networks());
+        let mut graph = Graph::new(&self.config, &self.policy, shape, device, &networks).unwrap();
+        let losses = graph.update(&self.policy, &self.batch, 1).unwrap();
+        let mut updated = Algorithm::new(&self.config, &self.policy, self.rule.as_ref()).unwrap();
+        updated.for_each_network(|name, network| graph.fetch(name, network)).unwrap();
+        (losses, updated)
+    }
+
+    fn compare(&self, losses: Losses, want_losses: Losses, reference: &Algorithm, what: &str) {
         let numbers = |losses: Losses| {
             let Losses { critic_loss, actor_loss, q_mean, temperature, entropy } = losses;
             let optional = [actor_loss, temperature, entropy].into_iter().flatten();
             optional.chain([critic_loss, q_mean]).collect::<Vec<f32>>()
         };
-        assert_close(&format!("losses, {what}"), &numbers(losses), &numbers(expected_losses));
+        assert_close(&format!("losses, {what}"), &numbers(losses), &numbers(want_losses));
         let read = |network: &Parameters| network.values().to_vec();
         for ((name, got), (_, want)) in
             self.algorithm.networks().into_iter().zip(reference.networks())
@@ -175,35 +196,42 @@ fn assert_fetched(here: &mut Case, there: &mut Case, what: &str) {
     }
 }
 
-/// Does the same as `--device cuda` on candle's CPU: updates by the graph, fetch, change on the
-/// host, and more updates by the graph.
 #[test]
 fn another_device_learns_the_same_and_hands_it_back() {
     for algorithm in ["ddpg", "td3", "sac"] {
-        let keys = [("algorithm.name", algorithm), ("algorithm.td3.actor_interval", "2")];
-        let (mut here, mut there) = (case(&keys), case(&keys));
-        there.algorithm.replica = Some(DeviceReplica::new(&there.config, Device::Cpu));
-        let run = |case: &mut Case, updates: std::ops::RangeInclusive<u64>| {
-            for update in updates {
-                case.algorithm.update(&case.policy, &case.batch, update).unwrap();
-            }
-        };
-        for case in [&mut here, &mut there] {
-            run(case, 1..=20);
+        for device in devices() {
+            check_replica(algorithm, device);
         }
-        assert_fetched(&mut here, &mut there, &format!("{algorithm}, 20 updates"));
-        // Networks change on the host when the observation normalisation is updated.
-        for case in [&mut here, &mut there] {
-            case.algorithm.fetch().unwrap();
-            let shrink = |_, network: &mut TrainableNetwork| {
-                network.parameters.values_mut().iter_mut().for_each(|value| *value *= 0.9);
-                Ok::<(), ()>(())
-            };
-            case.algorithm.for_each_network(shrink).unwrap();
-            run(case, 21..=23);
-        }
-        assert_fetched(&mut here, &mut there, &format!("{algorithm}, changed between"));
     }
+}
+
+/// Does the same as `--device cuda` on a device: updates by the graph, fetch, change on the host, and
+/// more updates by the graph.
+fn check_replica(algorithm: &str, device: Device) {
+    let what = format!("{algorithm}, {:?}", device.location());
+    let keys = [("algorithm.name", algorithm), ("algorithm.td3.actor_interval", "2")];
+    let (mut here, mut there) = (case(&keys), case(&keys));
+    there.algorithm.replica = Some(DeviceReplica::new(&there.config, device));
+    let run = |case: &mut Case, updates: std::ops::RangeInclusive<u64>| {
+        for update in updates {
+            case.algorithm.update(&case.policy, &case.batch, update).unwrap();
+        }
+    };
+    for case in [&mut here, &mut there] {
+        run(case, 1..=20);
+    }
+    assert_fetched(&mut here, &mut there, &format!("{what}, 20 updates"));
+    // Networks change on the host when the observation normalisation is updated.
+    for case in [&mut here, &mut there] {
+        case.algorithm.fetch().unwrap();
+        let shrink = |_, network: &mut TrainableNetwork| {
+            network.parameters.values_mut().iter_mut().for_each(|value| *value *= 0.9);
+            Ok::<(), ()>(())
+        };
+        case.algorithm.for_each_network(shrink).unwrap();
+        run(case, 21..=23);
+    }
+    assert_fetched(&mut here, &mut there, &format!("{what}, changed between"));
 }
 
 /// Candle's CPU takes both, a GPU neither.

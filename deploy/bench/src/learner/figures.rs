@@ -49,7 +49,7 @@ pub struct Figures {
     pub(super) replay_steps: usize,
     machine: Option<Machine>,
     /// Name, memory and driver of the GPUs, if the update runs on one.
-    gpu: Option<String>,
+    pub(super) gpu: Option<String>,
     load_average: Option<f64>,
     /// (name, rounds) of each available candidate.
     rounds: Vec<(&'static str, Vec<Timed>)>,
@@ -91,6 +91,11 @@ impl Figures {
     fn rounds(&self, name: &str) -> &[Timed] {
         let rounds = self.rounds.iter().find(|(known, _)| *known == name);
         rounds.map_or(&[], |(_, rounds)| rounds)
+    }
+
+    /// Returns the name of the processor.
+    pub(super) fn cpu(&self) -> Option<&str> {
+        self.machine.as_ref()?.cpu.as_deref()
     }
 
     pub(super) fn rounds_len(&self) -> usize {
@@ -199,7 +204,7 @@ impl Figures {
             "spread": each(&spread),
             "cpu_ms_per_update": each(&|name| self.cpu_ms(name).into()),
             "notes": notes,
-            "cpu": self.machine.as_ref().and_then(|machine| machine.cpu.clone()),
+            "cpu": self.cpu(),
             "cores": self.machine.as_ref().map(|machine| machine.cores),
             "load_average": self.load_average,
         });

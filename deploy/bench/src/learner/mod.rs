@@ -89,8 +89,7 @@ fn measure(bench: &LearnerBench, progress: &dyn Progress) -> anyhow::Result<Figu
         }
     }
     let mut learner = Learner::new(bench.config.clone(), &bench.spec, synthetic::RUN_ID)?;
-    fill(&mut learner, &bench.spec, bench.replay_steps)?;
-    figures.replay_steps = learner.replay.len() * learner.policy().layout().segment_steps;
+    figures.replay_steps = fill(&mut learner, &bench.spec, bench.replay_steps)?;
     watch.check()?;
     timed(bench.duration, || Ok(learner.update()?))?;
     // Measured before the benchmark allocates its own buffers.

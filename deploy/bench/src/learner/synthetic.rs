@@ -14,11 +14,13 @@ pub(crate) const STEPS: usize = 100_000;
 /// Phase step between two values. The sine never repeats, because 0.37 / 2 pi is irrational.
 const STRIDE: f32 = 0.37;
 
-/// Inserts complete episodes, one after the other, until the replay has `steps` or is full.
-pub(crate) fn fill(learner: &mut Learner, spec: &EnvSpec, steps: usize) -> anyhow::Result<()> {
+/// Inserts complete episodes, one after the other, until the replay has `steps` or is full. Returns
+/// the number of steps in it.
+pub(crate) fn fill(learner: &mut Learner, spec: &EnvSpec, steps: usize) -> anyhow::Result<usize> {
     let layout = learner.policy().layout();
     let mut segment = Segment::zeroed(layout);
-    let steps = steps.min(learner.config().replay.capacity_steps);
+    let capacity = learner.config().replay.capacity_steps;
+    let steps = steps.min(capacity);
     let (mut done, mut numbers, mut sequence, mut episode) = (0, 0, 0, 0);
     while done < steps {
         let mut episode_step = 0;
@@ -50,7 +52,7 @@ pub(crate) fn fill(learner: &mut Learner, spec: &EnvSpec, steps: usize) -> anyho
         done += spec.episode_steps as usize;
         episode += 1;
     }
-    Ok(())
+    Ok(done.min(capacity))
 }
 
 #[cfg(test)]

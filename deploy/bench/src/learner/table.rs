@@ -24,7 +24,12 @@ impl Figures {
                 if self.config.learner.device == Device::Cuda { " · cuda" } else { "" }
             )
             .to_lowercase(),
-            format!("median of {} rounds of {} s", self.rounds_len(), self.seconds),
+            format!(
+                "median of {} rounds of {} s, {}",
+                self.rounds_len(),
+                self.seconds,
+                self.gpu.as_deref().or(self.cpu()).unwrap_or("unknown processor")
+            ),
             String::new(),
             format!("  {:<15} {:>9} {:>9}   {:<19} ours", "", "ms/update", "CPU ms", "from … to"),
         ];

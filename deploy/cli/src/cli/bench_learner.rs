@@ -23,13 +23,16 @@ In every round each of these runs once for --seconds while the others sleep; the
   floor, ours     only its matrix products, with our kernels; several threads share the rows of
                   the batch
   floor, library  the same with the gemm crate; floor_ms is the faster of the two
+  processor limit as many multiplications and additions on registers, without memory
   torch, torch-compile, jax
                   the same update in eager PyTorch, or compiled by PyTorch or JAX, on as many
                   cores, with prepared batches (--peer; tests/peers/learner_peer.py). With a peer,
                   no actor has a penalty on changes of actions (algorithm.action_rate_penalty = 0)
 With --device cuda, only `ours` runs on the GPU, and samples the next batch meanwhile.
-Sampling and optimiser are also measured alone, as shares of the time. peak_memory_mb is the
-learner's (VmHWM), including its replay. Unavailable figures are null or `absent`, with the reason.
+Sampling and optimiser are also measured alone, as shares of the time, and with several threads how
+fast a cache line goes from core to core (handover_ns): in a virtual machine it tells whether the
+cores share a cache. peak_memory_mb is the learner's (VmHWM), including its replay. Unavailable
+figures are null or `absent`, with the reason.
 Ctrl-C stops the benchmark and leaves nothing behind.
 
 EXAMPLES

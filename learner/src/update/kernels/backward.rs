@@ -3,7 +3,7 @@
 use pulp::{Simd, WithSimd};
 
 use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
-use super::{InstructionSet, PANEL, with_scratch};
+use super::{InstructionSet, PANEL, fill_panel, with_scratch};
 
 /// The product gradient * weights for the rows of a shard, from column `first` of the inputs on.
 #[derive(Debug)]
@@ -52,26 +52,8 @@ struct Job<'a> {
     inputs_len: usize,
     /// First column of the current panel, relative to `first`.
     column: usize,
-    /// The weights of the current panel, (outputs, [`PANEL`]), padded with zeros. In place, rows of
-    /// wide layers would compete for the same few lines of the caches.
+    /// The weights of the current panel, (outputs, [`PANEL`]), padded with zeros.
     panel: &'a mut [f32],
-}
-
-impl Job<'_> {
-    fn fill_panel(&mut self) {
-        let width = PANEL.min(self.width - self.column);
-        let columns = self.layer.first + self.column..self.layer.first + self.column + width;
-        let rows = self.layer.weights.chunks_exact(self.inputs_len);
-        for (row, panel) in rows.zip(self.panel.chunks_exact_mut(PANEL)) {
-            match <&[f32; PANEL]>::try_from(&row[columns.clone()]) {
-                Ok(whole) => panel.copy_from_slice(whole),
-                Err(_) => {
-                    panel[..width].copy_from_slice(&row[columns.clone()]);
-                    panel[width..].fill(0.0);
-                }
-            }
-        }
-    }
 }
 
 impl WithSimd for Job<'_> {
@@ -80,7 +62,9 @@ impl WithSimd for Job<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         while self.column < self.width {
-            self.fill_panel();
+            let first = self.layer.first + self.column;
+            let columns = first..self.inputs_len.min(first + PANEL);
+            fill_panel(self.layer.weights.chunks_exact(self.inputs_len), columns, self.panel);
             for_rows(simd, 0..self.rows, &mut self);
             self.column += PANEL;
         }

@@ -3,15 +3,17 @@
 //! Every product of a network's forward and backward pass reads one operand as whole vectors and
 //! broadcasts single numbers of the other:
 //!
-//! | product                           | broadcast   | vectors                      |
-//! |-----------------------------------|-------------|------------------------------|
-//! | [`Forward`]   Y = act(X Wᵀ + b)   | X, by rows  | Wᵀ, in panels ([`pack`])     |
-//! | [`Backward`]  dX = dY W, masked   | dY, by rows | W, not copied                |
-//! | [`WeightGradient`] dW = Σ dYᵀ X   | dY, by columns | X, not copied             |
+//! | product                         | broadcast             | vectors                  |
+//! |---------------------------------|-----------------------|--------------------------|
+//! | [`Forward`]   Y = act(X Wᵀ + b) | X, by rows            | Wᵀ, in panels ([`pack`]) |
+//! | [`Backward`]  dX = dY W, masked | dY, by rows           | W, a panel at a time     |
+//! | [`WeightGradient`] dW = Σ dYᵀ X | dY, a panel at a time | X, not copied            |
 //!
-//! Therefore one register tile (`tile`) computes all of them, and only Wᵀ is copied. A tile keeps
-//! its outputs in registers from the first product to the last, so bias, ReLU and its mask need no
-//! pass over memory. Every output is summed in a fixed order, whatever the number of threads.
+//! Therefore one register tile (`tile`) computes all of them. A panel is a copy of [`PANEL`] columns
+//! whose rows follow each other: in wide layers the originals would compete for the same few lines
+//! of the caches. Those of Wᵀ are kept from update to update. A tile keeps its outputs in registers
+//! from the first product to the last, so bias, ReLU and its mask need no pass over memory. Every
+//! output is summed in a fixed order, whatever the number of threads.
 //!
 //! The source is generic over the vectors of `pulp` and compiled for AVX-512, AVX2 with FMA, NEON
 //! and plain code. [`InstructionSet::detect`] selects one at start.
@@ -38,6 +40,7 @@ pub use pack::{pack, packed_len};
 pub use weight_gradient::{GradientShard, WeightGradient};
 
 use std::cell::RefCell;
+use std::ops::Range;
 
 use pulp::{Arch, WithSimd};
 
@@ -100,4 +103,18 @@ fn with_scratch<T>(len: usize, f: impl FnOnce(&mut [f32]) -> T) -> T {
         }
         f(&mut scratch[..len])
     })
+}
+
+/// Copies `columns` of every row into a row of the panel, whose other columns become zero.
+#[inline(always)]
+fn fill_panel<'a>(rows: impl Iterator<Item = &'a [f32]>, columns: Range<usize>, panel: &mut [f32]) {
+    for (row, copy) in rows.zip(panel.chunks_exact_mut(PANEL)) {
+        match <&[f32; PANEL]>::try_from(&row[columns.clone()]) {
+            Ok(whole) => copy.copy_from_slice(whole),
+            Err(_) => {
+                copy[..columns.len()].copy_from_slice(&row[columns.clone()]);
+                copy[columns.len()..].fill(0.0);
+            }
+        }
+    }
 }

@@ -163,7 +163,7 @@ pub(super) fn load<S: Simd, const V: usize>(simd: S, row: &[f32]) -> [S::f32s; V
 #[inline(always)]
 pub(super) fn store<S: Simd, const V: usize>(simd: S, row: &mut [f32], values: [S::f32s; V]) {
     assert!(row.len() <= PANEL, "a tile is {PANEL} wide");
-    if row.len() == PANEL {
+    if row.len() == V * S::F32_LANES {
         // Stores with a mask take tens of cycles on AMD's processors before AVX-512.
         for (v, values) in values.into_iter().enumerate() {
             let at = row[v * S::F32_LANES..].as_mut_ptr();

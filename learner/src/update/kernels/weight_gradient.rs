@@ -5,7 +5,7 @@ use std::ops::Range;
 use pulp::{Simd, WithSimd};
 
 use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
-use super::{InstructionSet, PANEL, with_scratch};
+use super::{InstructionSet, PANEL, fill_panel, with_scratch};
 
 /// Shards that a tile sums before it stores the result. They are collected first, because calling
 /// an iterator in the middle of a tile would spill the tile's registers.
@@ -96,8 +96,7 @@ struct Job<'a> {
     accumulate_onto: bool,
     /// First column of the current panel.
     column: usize,
-    /// The gradient of the current outputs, (rows of all shards, [`PANEL`]). In place, rows of wide
-    /// layers would compete for the same few lines of the caches.
+    /// The gradient of the current panel of outputs, (rows of all shards, [`PANEL`]).
     gradient: &'a mut [f32],
 }
 
@@ -113,10 +112,12 @@ impl WithSimd for Job<'_> {
         let outputs = self.outputs.clone();
         // Row by row of tiles, so that a tile's rows of the gradient are still in the cache.
         for first in outputs.clone().step_by(PANEL) {
-            self.fill_gradient(first..outputs.end.min(first + PANEL));
+            let panel = first..outputs.end.min(first + PANEL);
+            let rows = self.shards.iter().flat_map(|s| s.gradient.chunks_exact(self.outputs_len));
+            fill_panel(rows, panel.clone(), self.gradient);
             self.column = 0;
             while self.column < self.inputs_len {
-                for_rows(simd, first..outputs.end.min(first + PANEL), &mut self);
+                for_rows(simd, panel.clone(), &mut self);
                 self.column += PANEL;
             }
         }
@@ -124,16 +125,6 @@ impl WithSimd for Job<'_> {
 }
 
 impl Job<'_> {
-    fn fill_gradient(&mut self, outputs: Range<usize>) {
-        let rows = self.shards.iter().flat_map(|s| s.gradient.chunks_exact(self.outputs_len));
-        for (row, copy) in rows.zip(self.gradient.chunks_exact_mut(PANEL)) {
-            match <&[f32; PANEL]>::try_from(&row[outputs.clone()]) {
-                Ok(whole) => copy.copy_from_slice(whole),
-                Err(_) => copy[..outputs.len()].copy_from_slice(&row[outputs.clone()]),
-            }
-        }
-    }
-
     #[inline(always)]
     fn bias<S: Simd>(&mut self, simd: S) {
         // Whole vectors of columns first, then the remaining columns one by one.
