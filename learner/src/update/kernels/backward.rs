@@ -52,7 +52,7 @@ struct Job<'a> {
     inputs_len: usize,
     /// First column of the current panel, relative to `first`.
     column: usize,
-    /// The weights of the current panel, (outputs, [`PANEL`]), padded with zeros.
+    /// The weights of the current panel, (outputs, [`PANEL`]).
     panel: &'a mut [f32],
 }
 

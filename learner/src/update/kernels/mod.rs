@@ -105,16 +105,13 @@ fn with_scratch<T>(len: usize, f: impl FnOnce(&mut [f32]) -> T) -> T {
     })
 }
 
-/// Copies `columns` of every row into a row of the panel, whose other columns become zero.
+/// Copies `columns` of every row into a row of the panel. No result may depend on its other columns.
 #[inline(always)]
 fn fill_panel<'a>(rows: impl Iterator<Item = &'a [f32]>, columns: Range<usize>, panel: &mut [f32]) {
     for (row, copy) in rows.zip(panel.chunks_exact_mut(PANEL)) {
         match <&[f32; PANEL]>::try_from(&row[columns.clone()]) {
             Ok(whole) => copy.copy_from_slice(whole),
-            Err(_) => {
-                copy[..columns.len()].copy_from_slice(&row[columns.clone()]);
-                copy[columns.len()..].fill(0.0);
-            }
+            Err(_) => copy[..columns.len()].copy_from_slice(&row[columns.clone()]),
         }
     }
 }
