@@ -11,6 +11,7 @@ use safetensors::SafeTensors;
 use serde_json::Value;
 
 use super::*;
+use crate::algorithms::tests::alone_on_gpu;
 use crate::learner::tests::spec;
 
 /// Maximum difference after the first updates, relative to a tensor's norm.
@@ -118,6 +119,7 @@ impl Golden {
 
     /// Runs all updates by kernels or graphs and compares them with the file.
     fn check(mut self, backend: Backend, device: config::Device) {
+        let _alone = alone_on_gpu();
         let mut config = self.config();
         config.learner.backend = backend;
         config.learner.device = device;

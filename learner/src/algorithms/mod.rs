@@ -95,8 +95,7 @@ impl Algorithm {
         };
         let device = match config.learner.device {
             config::Device::Cpu => Device::Cpu,
-            // The device's stream is that of the thread that uses it: the learner's, as here.
-            config::Device::Cuda => Device::new_cuda(0).map_err(|error| {
+            config::Device::Cuda => graph::open_gpu().map_err(|error| {
                 error.context("learner.device = \"cuda\": cannot use a GPU (see `dmprl doctor`)")
             })?,
         };

@@ -4,6 +4,7 @@
 use std::iter;
 
 use dmprl_shared::config::Layers;
+use parking_lot::{Mutex, MutexGuard};
 use rand::RngExt;
 
 use super::*;
@@ -72,10 +73,17 @@ fn case_with(keys: &[(&str, &str)], rule: Option<GoalRule>) -> Case {
     Case { config, rule, policy, algorithm, batch }
 }
 
+/// Waits until no other test uses the GPU. CUDA can record no update while another thread opens the
+/// same GPU.
+pub(super) fn alone_on_gpu() -> Option<MutexGuard<'static, ()>> {
+    static GPU: Mutex<()> = Mutex::new(());
+    cfg!(feature = "cuda").then(|| GPU.lock())
+}
+
 /// The devices of graphs here: candle's CPU and, in a build with the feature `cuda`, the GPU that
 /// such a build is tested on.
-pub(super) fn devices() -> Vec<Device> {
-    let gpu = cfg!(feature = "cuda").then(|| Device::new_cuda(0).unwrap());
+fn devices() -> Vec<Device> {
+    let gpu = cfg!(feature = "cuda").then(|| graph::open_gpu().unwrap());
     iter::once(Device::Cpu).chain(gpu).collect()
 }
 
@@ -83,9 +91,11 @@ impl Case {
     /// Compares one update by our kernels with one by candle's graph on each device, from the same
     /// state.
     pub(super) fn check(&mut self, what: &str) {
-        let expected: Vec<_> = devices().iter().map(|device| self.update_graph(device)).collect();
+        let _alone = alone_on_gpu();
+        let devices = devices();
+        let expected: Vec<_> = devices.iter().map(|device| self.update_graph(device)).collect();
         let losses = self.algorithm.update(&self.policy, &self.batch, 1).unwrap();
-        for (device, (expected_losses, reference)) in devices().iter().zip(expected) {
+        for (device, (expected_losses, reference)) in devices.iter().zip(expected) {
             let what = format!("{what}, {:?}", device.location());
             self.compare(losses, expected_losses, &reference, &what);
         }
@@ -198,6 +208,7 @@ fn assert_fetched(here: &mut Case, there: &mut Case, what: &str) {
 
 #[test]
 fn another_device_learns_the_same_and_hands_it_back() {
+    let _alone = alone_on_gpu();
     for algorithm in ["ddpg", "td3", "sac"] {
         for device in devices() {
             check_replica(algorithm, device);
@@ -205,8 +216,8 @@ fn another_device_learns_the_same_and_hands_it_back() {
     }
 }
 
-/// Does the same as `--device cuda` on a device: updates by the graph, fetch, change on the host, and
-/// more updates by the graph.
+/// Does the same as `--device cuda` on a device: updates by the graph, fetch, change on the host,
+/// and more updates by the graph.
 fn check_replica(algorithm: &str, device: Device) {
     let what = format!("{algorithm}, {:?}", device.location());
     let keys = [("algorithm.name", algorithm), ("algorithm.td3.actor_interval", "2")];
@@ -246,7 +257,8 @@ fn a_batch_on_the_device_has_no_empty_tensor_and_no_rows_with_gaps() {
     ];
     for case in cases {
         let (shape, networks) = (case.algorithm.batch_shape(), case.algorithm.networks());
-        let graph = Graph::new(&case.config, &case.policy, shape, &Device::Cpu, &networks).unwrap();
+        let mut graph =
+            Graph::new(&case.config, &case.policy, shape, &Device::Cpu, &networks).unwrap();
         graph.assert_fits_a_gpu(&case.policy, &case.batch);
     }
 }

@@ -3,8 +3,8 @@
 use candle_core::{Result, Tensor};
 use dmprl_shared::policy::{Head, Policy};
 
-use super::Graph;
 use super::policy::DeviceStates;
+use super::{FACTORS, Graph};
 use crate::algorithms::batch::Batch;
 
 /// The tensors of a [`Batch`]. Unused ones are `None`, because a GPU has no empty tensors.
@@ -52,9 +52,21 @@ pub(super) fn needed<'a>(part: &'a Option<Tensor>, name: &str) -> Result<&'a Ten
     }
 }
 
+/// The numbers of the host that an update needs, on the device.
+#[derive(Debug)]
+pub(super) struct Upload {
+    /// All parts, one after the other.
+    block: Tensor,
+    lens: [usize; PARTS],
+    target_range: [f32; 2],
+}
+
+/// The tensors of a batch, and the factors of Adam's steps.
+const PARTS: usize = 15;
+
 impl Graph {
     /// Copies a batch to the device. It is one copy, because each has a price besides its bytes.
-    pub(super) fn batch(&self, policy: &Policy, batch: &Batch) -> Result<DeviceBatch> {
+    pub(super) fn upload(&mut self, policy: &Policy, batch: &Batch) -> Result<()> {
         let starts = |observations: &Vec<f32>| match policy.head() {
             Head::Dmp(head) => head.starts(observations),
             Head::Mlp => Vec::new(),
@@ -62,7 +74,8 @@ impl Graph {
         let observations = [&batch.observations, &batch.next_observations];
         let [starts, next_starts] = observations.map(starts);
         let [distances, next_distances] = observations.map(|rows| self.goal_distances(rows));
-        let parts: [&[f32]; 14] = [
+        let factors: Vec<_> = self.networks.iter().flat_map(|it| it.next_factors()).collect();
+        let parts: [&[f32]; PARTS] = [
             &batch.inputs,
             &starts,
             &distances,
@@ -77,17 +90,32 @@ impl Graph {
             &batch.motion,
             &batch.rewards,
             &batch.bootstrap,
+            &factors,
         ];
-        let block = parts.concat();
-        let len = block.len();
-        let block = Tensor::from_vec(block, len, &self.device)?;
+        let lens = parts.map(<[f32]>::len);
+        let block = Tensor::from_vec(parts.concat(), lens.iter().sum::<usize>(), &self.device)?;
+        let target_range = batch.target_range;
+        match &self.upload {
+            Some(last) if last.lens == lens && last.target_range == target_range => {
+                last.block.slice_set(&block, 0, 0)
+            }
+            _ => {
+                self.upload = Some(Upload { block, lens, target_range });
+                #[cfg(feature = "cuda")]
+                self.recordings.forget();
+                Ok(())
+            }
+        }
+    }
+
+    /// Returns the batch that was copied to the device.
+    pub(super) fn batch(&self) -> Result<DeviceBatch> {
+        let Upload { block, lens, target_range } = self.uploaded()?;
+        let [lens @ .., _] = *lens;
         let mut end = 0;
-        let views = parts.map(|part| {
-            end += part.len();
-            (!part.is_empty()).then(|| {
-                let view = block.narrow(0, end - part.len(), part.len())?;
-                view.reshape((self.shape.rows, ()))
-            })
+        let views = lens.map(|len| {
+            end += len;
+            (len > 0).then(|| block.narrow(0, end - len, len)?.reshape((self.shape.rows, ())))
         });
         let [inputs, starts, distances, next_inputs, next_starts, next_distances, views @ ..] =
             views;
@@ -104,8 +132,23 @@ impl Graph {
             motion: motion.transpose()?,
             rewards: present(rewards)?,
             bootstrap: present(bootstrap)?,
-            target_range: batch.target_range,
+            target_range: *target_range,
         })
+    }
+
+    /// Returns the factors of the next step of network number `network`, ([`FACTORS`],), which were
+    /// copied to the device.
+    pub(super) fn factors(&self, network: usize) -> Result<Tensor> {
+        let Upload { block, lens, .. } = self.uploaded()?;
+        let [before @ .., _] = lens;
+        block.narrow(0, before.iter().sum::<usize>() + network * FACTORS, FACTORS)
+    }
+
+    fn uploaded(&self) -> Result<&Upload> {
+        match &self.upload {
+            Some(upload) => Ok(upload),
+            None => candle_core::bail!("there is no batch on the device"),
+        }
     }
 
     fn states(&self, inputs: View, starts: View, distances: View) -> Result<DeviceStates> {
@@ -128,8 +171,9 @@ fn present(view: View) -> Result<Tensor> {
 impl Graph {
     /// Fails if a batch has tensors that candle takes on a CPU, but not on a GPU: empty ones, and
     /// inputs of products whose rows have gaps.
-    pub(crate) fn assert_fits_a_gpu(&self, policy: &Policy, batch: &Batch) {
-        let batch = self.batch(policy, batch).unwrap();
+    pub(crate) fn assert_fits_a_gpu(&mut self, policy: &Policy, batch: &Batch) {
+        self.upload(policy, batch).unwrap();
+        let batch = self.batch().unwrap();
         let DeviceBatch { states, next_states, critic_inputs, next_noise, noise, .. } = &batch;
         let mut optional = vec![next_noise, noise, &batch.motion];
         for states in [states, next_states] {

@@ -13,6 +13,8 @@ mod modules;
 mod network;
 mod outcome;
 mod policy;
+#[cfg(feature = "cuda")]
+mod recording;
 mod sac;
 mod td3;
 mod tqc;
@@ -27,8 +29,8 @@ use dmprl_shared::policy::Policy;
 use crate::algorithms::batch::{Batch, BatchShape};
 use crate::algorithms::losses::Losses;
 use crate::update::network::TrainableNetwork;
-use batch::DeviceBatch;
-use losses::DeviceLosses;
+use batch::{DeviceBatch, Upload};
+use losses::{DeviceLosses, FIGURES, Present};
 use network::DeviceNetwork;
 use policy::{DeviceStates, Means, PolicyGraph, mlp};
 
@@ -60,7 +62,15 @@ trait GraphAlgorithm: Debug + Send + Sync {
         Ok(None)
     }
 
-    /// Does update number `update`, counted from 1, except for the outcome model.
+    /// Returns a number for the operations of an update: updates with the same one do the same. A
+    /// GPU records one update of each.
+    #[cfg_attr(not(feature = "cuda"), expect(dead_code))]
+    fn variant(&self, _: &ExperimentConfig, _update: u64) -> u64 {
+        0
+    }
+
+    /// Does update number `update`, counted from 1, except for the outcome model. It depends on the
+    /// number by its [variant](GraphAlgorithm::variant) only, and reads nothing from the device.
     ///
     /// # Errors
     /// If a device operation fails.
@@ -76,6 +86,9 @@ struct Context<'a> {
     config: &'a ExperimentConfig,
     shape: BatchShape,
 }
+
+/// Numbers that a step of Adam needs from the host.
+const FACTORS: usize = 2;
 
 /// Which of a network's parameters are used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -113,6 +126,29 @@ pub struct Graph {
     device: Device,
     policy: PolicyGraph,
     networks: Vec<DeviceNetwork>,
+    /// Batch and factors of the current update.
+    upload: Option<Upload>,
+    /// Losses of the last update, ([`FIGURES`],).
+    figures: Tensor,
+    #[cfg(feature = "cuda")]
+    recordings: recording::Recordings,
+}
+
+/// Opens the first GPU, with one stream for all operations.
+///
+/// # Errors
+/// If there is none, or the program was built without the feature `cuda`.
+pub(crate) fn open_gpu() -> Result<Device> {
+    // candle's other stream is that of a thread. A thread keeps sizes for recordings, which would
+    // be freed at its end, when that stream does not exist any more.
+    let gpu = Device::new_cuda_with_stream(0)?;
+    #[cfg(feature = "cuda")]
+    // SAFETY: nothing uses another stream of this device, so its operations are done in order. A
+    // recording must not wait for events that are not in it.
+    unsafe {
+        gpu.as_cuda_device()?.disable_event_tracking();
+    }
+    Ok(gpu)
 }
 
 /// Returns the algorithm of a name.
@@ -163,6 +199,10 @@ impl Graph {
             device: device.clone(),
             policy: PolicyGraph::new(config, policy, device)?,
             networks: networks.collect::<Result<_>>()?,
+            upload: None,
+            figures: Tensor::zeros(FIGURES, DType::F32, device)?,
+            #[cfg(feature = "cuda")]
+            recordings: recording::Recordings::default(),
         })
     }
 
@@ -188,9 +228,21 @@ impl Graph {
     /// # Errors
     /// If a device operation fails.
     pub fn update(&mut self, policy: &Policy, batch: &Batch, update: u64) -> Result<Losses> {
-        let mut batch = self.batch(policy, batch)?;
+        self.upload(policy, batch)?;
+        #[cfg(feature = "cuda")]
+        if let Device::Cuda(gpu) = self.device.clone() {
+            let present = self.compute_on_gpu(&gpu, update)?;
+            return losses::read(&self.figures, present);
+        }
+        let present = self.compute(update)?;
+        losses::read(&self.figures, present)
+    }
+
+    /// Does an update with the batch on the device. Returns which losses it has written.
+    fn compute(&mut self, update: u64) -> Result<Present> {
+        let mut batch = self.batch()?;
         self.outcome_step(&mut batch)?;
-        self.algorithm.update(self, &batch, update)?.read()
+        self.algorithm.update(self, &batch, update)?.write(&self.figures)
     }
 
     fn network(&self, name: &str) -> Result<&DeviceNetwork> {
@@ -331,15 +383,16 @@ impl Graph {
     /// target network, if there is one.
     fn descend(&mut self, name: &str, loss: &Tensor, moves_target: bool) -> Result<()> {
         let gradient = self.network(name)?.gradient_of(loss)?;
-        self.step(name, gradient, moves_target)
+        self.step(name, &gradient, moves_target)
     }
 
     /// Does one step of Adam with a known gradient, (P,).
-    fn step(&mut self, name: &str, gradient: Tensor, moves_target: bool) -> Result<()> {
-        let polyak = self.config.algorithm.polyak;
-        match self.networks.iter_mut().find(|network| network.name == name) {
-            Some(network) => network.step(gradient, moves_target.then_some(polyak)),
-            None => candle_core::bail!("the device has no network {name}"),
-        }
+    fn step(&mut self, name: &str, gradient: &Tensor, moves_target: bool) -> Result<()> {
+        let polyak = moves_target.then_some(self.config.algorithm.polyak);
+        let Some(index) = self.networks.iter().position(|network| network.name == name) else {
+            candle_core::bail!("the device has no network {name}")
+        };
+        let factors = self.factors(index)?;
+        self.networks[index].descend(gradient, &factors, polyak)
     }
 }

@@ -1,13 +1,14 @@
 //! A network with its target and optimiser on the device.
 //!
 //! Optimiser and target handle the parameters as one vector. Gradients are computed for its parts,
-//! the variables. candle would pad the gradient of each part to the length of the vector.
+//! the variables. candle would pad the gradient of each part to the length of the vector. All of
+//! them are written in place, as a recorded update requires (`recording`).
 
 use candle_core::{Device, Result, Tensor, Var};
 use dmprl_shared::policy::MlpShape;
 
-use super::Of;
 use super::modules::Variable;
+use super::{FACTORS, Of};
 use crate::update::kernels::{BETA1, BETA2, EPSILON};
 use crate::update::network::TrainableNetwork;
 
@@ -26,10 +27,11 @@ pub(super) struct DeviceNetwork {
     pub(super) parameters: Tensor,
     target: Option<Tensor>,
     moments: [Tensor; 2],
-    step: u64,
+    /// Steps of Adam.
+    pub(super) step: u64,
     learning_rate: f64,
-    /// Gradient of the last step.
-    gradient: Option<Tensor>,
+    /// Gradient of the last step, (P,).
+    gradient: Tensor,
 }
 
 impl DeviceNetwork {
@@ -59,7 +61,7 @@ impl DeviceNetwork {
             moments: [to(&moments.first)?, to(&moments.second)?],
             step: network.adam.step.0,
             learning_rate: network.adam.learning_rate(),
-            gradient: None,
+            gradient: to(network.gradient())?,
         })
     }
 
@@ -72,9 +74,7 @@ impl DeviceNetwork {
         network.adam.moments.first = self.moments[0].to_vec1()?;
         network.adam.moments.second = self.moments[1].to_vec1()?;
         network.adam.step.0 = self.step;
-        if let Some(gradient) = &self.gradient {
-            network.set_gradient(&gradient.to_vec1::<f32>()?);
-        }
+        network.set_gradient(&self.gradient.to_vec1::<f32>()?);
         Ok(())
     }
 
@@ -108,26 +108,41 @@ impl DeviceNetwork {
         Ok(Tensor::cat(&parts.collect::<Result<Vec<_>>>()?, 0)?.detach())
     }
 
-    /// Does one step of Adam. With `polyak`, it also moves the target, if there is one.
-    pub(super) fn step(&mut self, gradient: Tensor, polyak: Option<f64>) -> Result<()> {
+    /// Returns the factors of the next step, which depend on its number: that of the second
+    /// moment's root, and that of the change.
+    pub(super) fn next_factors(&self) -> [f32; FACTORS] {
+        let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.step as f64 + 1.0);
+        let change = self.learning_rate / correction(BETA1);
+        [(1.0 / correction(BETA2).sqrt()) as f32, change as f32]
+    }
+
+    /// Does one step of Adam with [`DeviceNetwork::next_factors`], ([`FACTORS`],). With `polyak`,
+    /// it also moves the target, if there is one.
+    pub(super) fn descend(
+        &mut self,
+        gradient: &Tensor,
+        factors: &Tensor,
+        polyak: Option<f64>,
+    ) -> Result<()> {
         self.step += 1;
-        let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.step as f64);
         let [first, second] = &self.moments;
         let (beta1, beta2) = (f64::from(BETA1), f64::from(BETA2));
-        let first = ((first * beta1)? + (&gradient * (1.0 - beta1))?)?;
-        let second = ((second * beta2)? + (gradient.sqr()? * (1.0 - beta2))?)?;
-        let root = (second.sqrt()? / correction(BETA2).sqrt())?;
-        let change = (&first / (root + f64::from(EPSILON))?)?;
-        let change = (change * (self.learning_rate / correction(BETA1)))?;
-        self.parameters = (&self.parameters - change)?;
+        let new_first = ((first * beta1)? + (gradient * (1.0 - beta1))?)?;
+        let new_second = ((second * beta2)? + (gradient.sqr()? * (1.0 - beta2))?)?;
+        let root = new_second.sqrt()?.broadcast_mul(&factors.narrow(0, 0, 1)?)?;
+        let change = (&new_first / (root + f64::from(EPSILON))?)?;
+        let change = change.broadcast_mul(&factors.narrow(0, 1, 1)?)?;
+        let parameters = (&self.parameters - change)?;
         for (leaf, part) in self.leaves.iter().zip(&self.variables) {
-            leaf.set(&part.view(&self.parameters)?)?;
+            leaf.set(&part.view(&parameters)?)?;
         }
-        if let (Some(target), Some(polyak)) = (&mut self.target, polyak) {
-            *target = (&*target + ((&self.parameters - &*target)? * polyak)?)?;
+        if let (Some(target), Some(polyak)) = (&self.target, polyak) {
+            let moved = (target + ((&parameters - target)? * polyak)?)?;
+            target.slice_set(&moved, 0, 0)?;
         }
-        self.moments = [first, second];
-        self.gradient = Some(gradient);
-        Ok(())
+        first.slice_set(&new_first, 0, 0)?;
+        second.slice_set(&new_second, 0, 0)?;
+        self.parameters.slice_set(&parameters, 0, 0)?;
+        self.gradient.slice_set(gradient, 0, 0)
     }
 }

@@ -64,7 +64,7 @@ impl Graph {
         let wanted = per_action * self.shape.segment_actions_len as f64;
         // The gradient of -log temperature (mean log pi + target entropy).
         let gradient = (entropy.reshape(1)? - wanted)?;
-        self.step("log_temperature", gradient, false)?;
+        self.step("log_temperature", &gradient, false)?;
         Ok(DeviceLosses {
             actor_loss: Some(loss),
             entropy: Some(entropy),

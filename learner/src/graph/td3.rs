@@ -1,6 +1,7 @@
 //! TD3 as a graph; see `algorithms::td3` for paper and differences.
 
 use candle_core::Result;
+use dmprl_shared::config::ExperimentConfig;
 
 use super::batch::{DeviceBatch, needed};
 use super::losses::DeviceLosses;
@@ -12,6 +13,10 @@ const CRITICS: [&str; 2] = ["critic_1", "critic_2"];
 pub(super) struct Td3;
 
 impl GraphAlgorithm for Td3 {
+    fn variant(&self, config: &ExperimentConfig, update: u64) -> u64 {
+        u64::from(update.is_multiple_of(config.algorithm.td3.actor_interval))
+    }
+
     fn update(&self, graph: &mut Graph, batch: &DeviceBatch, update: u64) -> Result<DeviceLosses> {
         let td3 = graph.config.algorithm.td3.clone();
         let updates_actor = update.is_multiple_of(td3.actor_interval);

@@ -9,11 +9,11 @@
 //! | [`Backward`]  dX = dY W, masked | dY, by rows           | W, a panel at a time     |
 //! | [`WeightGradient`] dW = Σ dYᵀ X | dY, a panel at a time | X, not copied            |
 //!
-//! Therefore one register tile (`tile`) computes all of them. A panel is a copy of [`PANEL`] columns
-//! whose rows follow each other: in wide layers the originals would compete for the same few lines
-//! of the caches. Those of Wᵀ are kept from update to update. A tile keeps its outputs in registers
-//! from the first product to the last, so bias, ReLU and its mask need no pass over memory. Every
-//! output is summed in a fixed order, whatever the number of threads.
+//! Therefore one register tile (`tile`) computes all of them. A panel is a copy of [`PANEL`]
+//! columns whose rows follow each other: in wide layers the originals would compete for the same
+//! few lines of the caches. Those of Wᵀ are kept from update to update. A tile keeps its outputs in
+//! registers from the first product to the last, so bias, ReLU and its mask need no pass over
+//! memory. Every output is summed in a fixed order, whatever the number of threads.
 //!
 //! The source is generic over the vectors of `pulp` and compiled for AVX-512, AVX2 with FMA, NEON
 //! and plain code. [`InstructionSet::detect`] selects one at start.
@@ -105,7 +105,8 @@ fn with_scratch<T>(len: usize, f: impl FnOnce(&mut [f32]) -> T) -> T {
     })
 }
 
-/// Copies `columns` of every row into a row of the panel. No result may depend on its other columns.
+/// Copies `columns` of every row into a row of the panel. No result may depend on its other
+/// columns.
 #[inline(always)]
 fn fill_panel<'a>(rows: impl Iterator<Item = &'a [f32]>, columns: Range<usize>, panel: &mut [f32]) {
     for (row, copy) in rows.zip(panel.chunks_exact_mut(PANEL)) {
