@@ -23,7 +23,7 @@ use anyhow::Context;
 use dmprl_learner::learner::Learner;
 use dmprl_run::Progress;
 use dmprl_run::{Interrupted, Watch};
-use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::config::{ExperimentConfig, Precision};
 use dmprl_shared::spec::EnvSpec;
 
 use super::child::resident_bytes_max;
@@ -150,7 +150,10 @@ impl OwnWork {
         figures.add(OURS, timed(duration, || Ok(learner.update()?))?);
         watch.check()?;
         figures.add(KERNELS, floor.measure(Engine::Kernels, duration)?);
-        figures.add(LIMIT, limit.measure(duration)?);
+        // The limit is that of 32-bit numbers.
+        if learner.config().learner.precision == Precision::F32 {
+            figures.add(LIMIT, limit.measure(duration)?);
+        }
         if learner.config().learner.threads > 1 {
             figures.add(HANDOVER, handover());
         }

@@ -67,7 +67,7 @@ impl FloorWork {
                 let rows = product.rows * (index + 1) / threads - product.rows * index / threads;
                 (rows > 0).then_some(Product { rows, ..*product })
             };
-            Floor::new(products.iter().filter_map(of))
+            Floor::new(products.iter().filter_map(of), learner.config().learner.precision)
         };
         Self {
             pool: ThreadPool::new(threads),

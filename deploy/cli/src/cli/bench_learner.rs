@@ -20,9 +20,9 @@ const HELP: &str = "\
 In every round each of these runs once for --seconds while the others sleep; the median counts.
   ours            the update of a run, on a replay full of synthetic segments of the task's sizes:
                   it samples a batch and updates every network; no Python, no environment
-  floor, ours     only its matrix products, with our kernels; several threads share the rows of
-                  the batch
-  floor, library  the same with the gemm crate; floor_ms is the faster of the two
+  floor, ours     only its matrix products, with our kernels, of 16-bit numbers with
+                  learner.precision = bf16; several threads share the rows of the batch
+  floor, library  the same of 32-bit numbers with the gemm crate; floor_ms is the faster of the two
   processor limit as many multiplications and additions on registers, without memory
   torch, torch-compile, jax
                   the same update in eager PyTorch, or compiled by PyTorch or JAX, on as many
