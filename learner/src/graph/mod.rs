@@ -62,19 +62,17 @@ trait GraphAlgorithm: Debug + Send + Sync {
         Ok(None)
     }
 
-    /// Returns a number for the operations of an update: updates with the same one do the same. A
-    /// GPU records one update of each.
-    #[cfg_attr(not(feature = "cuda"), expect(dead_code))]
+    /// Returns the variant of update number `update`, counted from 1. Updates of the same variant
+    /// do the same operations, of which a GPU records one.
     fn variant(&self, _: &ExperimentConfig, _update: u64) -> u64 {
         0
     }
 
-    /// Does update number `update`, counted from 1, except for the outcome model. It depends on the
-    /// number by its [variant](GraphAlgorithm::variant) only, and reads nothing from the device.
+    /// Does an update of `variant`, except for the outcome model. It must not read from the device.
     ///
     /// # Errors
     /// If a device operation fails.
-    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, update: u64) -> Result<DeviceLosses>;
+    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, variant: u64) -> Result<DeviceLosses>;
 }
 
 /// Networks with their names in a checkpoint.
@@ -139,12 +137,12 @@ pub struct Graph {
 /// # Errors
 /// If there is none, or the program was built without the feature `cuda`.
 pub(crate) fn open_gpu() -> Result<Device> {
-    // candle's other stream is that of a thread. A thread keeps sizes for recordings, which would
-    // be freed at its end, when that stream does not exist any more.
+    // By default candle uses the stream of the thread. It also keeps memory for recordings until
+    // the thread ends, and freeing that on the thread's stream crashed.
     let gpu = Device::new_cuda_with_stream(0)?;
     #[cfg(feature = "cuda")]
-    // SAFETY: nothing uses another stream of this device, so its operations are done in order. A
-    // recording must not wait for events that are not in it.
+    // SAFETY: all operations of this device are on this stream, so they are done in order. A
+    // recording must not wait for events outside it.
     unsafe {
         gpu.as_cuda_device()?.disable_event_tracking();
     }
@@ -229,20 +227,21 @@ impl Graph {
     /// If a device operation fails.
     pub fn update(&mut self, policy: &Policy, batch: &Batch, update: u64) -> Result<Losses> {
         self.upload(policy, batch)?;
+        let variant = self.algorithm.variant(&self.config, update);
         #[cfg(feature = "cuda")]
         if let Device::Cuda(gpu) = self.device.clone() {
-            let present = self.compute_on_gpu(&gpu, update)?;
+            let present = self.compute_on_gpu(&gpu, variant)?;
             return losses::read(&self.figures, present);
         }
-        let present = self.compute(update)?;
+        let present = self.compute(variant)?;
         losses::read(&self.figures, present)
     }
 
     /// Does an update with the batch on the device. Returns which losses it has written.
-    fn compute(&mut self, update: u64) -> Result<Present> {
+    fn compute(&mut self, variant: u64) -> Result<Present> {
         let mut batch = self.batch()?;
         self.outcome_step(&mut batch)?;
-        self.algorithm.update(self, &batch, update)?.write(&self.figures)
+        self.algorithm.update(self, &batch, variant)?.write(&self.figures)
     }
 
     fn network(&self, name: &str) -> Result<&DeviceNetwork> {

@@ -1,9 +1,9 @@
-//! Updates on a GPU as one operation each.
+//! Records updates on a GPU as CUDA graphs, and repeats them.
 //!
-//! An update starts hundreds of small operations, and starting one takes the processor longer than
-//! a GPU needs for most of them. CUDA can record the operations of an update as a graph and then
-//! starts them together. Every tensor of a recorded update keeps its place in memory, so batch,
-//! networks and losses are written in place (`batch`, `network`, `losses`).
+//! An update starts hundreds of small operations, and starting one takes longer than the GPU needs
+//! for most of them. CUDA starts a recorded update as a whole. Everything that it reads or writes
+//! must keep its place in memory, so batch, networks and losses are written in place (`batch`,
+//! `network`, `losses`).
 
 use std::collections::BTreeMap;
 use std::fmt::{Debug, Formatter};
@@ -16,14 +16,14 @@ use candle_core::{Error, Result};
 use super::Graph;
 use super::losses::Present;
 
-/// The recorded updates of each variant (`GraphAlgorithm::variant`).
+/// The recorded update of each variant (`GraphAlgorithm::variant`).
 #[derive(Debug, Default)]
 pub(super) struct Recordings(BTreeMap<u64, Variant>);
 
 #[derive(Debug)]
 enum Variant {
-    /// Done once, so candle has loaded its kernels and uploaded the sizes of their operands, which
-    /// is impossible while operations are recorded.
+    /// Was done once. candle then has its kernels and the sizes of their operands on the GPU, where
+    /// it can copy neither while operations are recorded.
     Prepared,
     Recorded(Recording),
 }
@@ -50,29 +50,28 @@ impl Debug for Recording {
 }
 
 impl Recordings {
-    /// Drops all recordings, as something has got another place in memory.
+    /// Drops all recordings, because something has moved in memory.
     pub(super) fn forget(&mut self) {
         self.0.clear();
     }
 }
 
 impl Graph {
-    /// Does update number `update` on a GPU, with the batch that was copied to it. The operations
-    /// of the first update of a variant are started one by one, those of the second are recorded.
-    pub(super) fn compute_on_gpu(&mut self, gpu: &CudaDevice, update: u64) -> Result<Present> {
-        let key = self.algorithm.variant(&self.config, update);
-        match self.recordings.0.get(&key) {
+    /// Does an update on a GPU, with the batch that was copied to it. The operations of the first
+    /// update of a variant are started one by one, those of the second are recorded.
+    pub(super) fn compute_on_gpu(&mut self, gpu: &CudaDevice, variant: u64) -> Result<Present> {
+        match self.recordings.0.get(&variant) {
             None => {
                 let _cache = gpu.enable_cuda_graph_htod_cache();
-                let present = self.compute(update)?;
-                self.recordings.0.insert(key, Variant::Prepared);
+                let present = self.compute(variant)?;
+                self.recordings.0.insert(variant, Variant::Prepared);
                 Ok(present)
             }
             Some(Variant::Prepared) => {
-                let recording = self.record(gpu, update)?;
+                let recording = self.record(gpu, variant)?;
                 recording.graph.launch().w()?;
                 let present = recording.present;
-                self.recordings.0.insert(key, Variant::Recorded(recording));
+                self.recordings.0.insert(variant, Variant::Recorded(recording));
                 Ok(present)
             }
             Some(Variant::Recorded(recording)) => {
@@ -83,14 +82,14 @@ impl Graph {
         }
     }
 
-    /// Records an update, which is not done yet then.
-    fn record(&mut self, gpu: &CudaDevice, update: u64) -> Result<Recording> {
+    /// Records an update without doing it.
+    fn record(&mut self, gpu: &CudaDevice, variant: u64) -> Result<Recording> {
         let steps = |graph: &Self| graph.networks.iter().map(|it| it.step).collect::<Vec<_>>();
         let before = steps(self);
         let stream = gpu.cuda_stream();
         let _cache = gpu.enable_cuda_graph_htod_cache();
         stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_THREAD_LOCAL).w()?;
-        let computed = self.compute(update);
+        let computed = self.compute(variant);
         // Ends the recording even if an operation failed.
         let flags = CUgraphInstantiate_flags::CUDA_GRAPH_INSTANTIATE_FLAG_AUTO_FREE_ON_LAUNCH;
         let graph = stream.end_capture(flags).w();

@@ -9,17 +9,25 @@ use super::{CriticStep, Graph, GraphAlgorithm, Of};
 
 const CRITICS: [&str; 2] = ["critic_1", "critic_2"];
 
+/// Variant of an update that leaves the actor and all targets as they are.
+const CRITICS_ONLY: u64 = 0;
+/// Variant of an update of all networks.
+const WITH_ACTOR: u64 = 1;
+
 #[derive(Debug)]
 pub(super) struct Td3;
 
 impl GraphAlgorithm for Td3 {
     fn variant(&self, config: &ExperimentConfig, update: u64) -> u64 {
-        u64::from(update.is_multiple_of(config.algorithm.td3.actor_interval))
+        match update.is_multiple_of(config.algorithm.td3.actor_interval) {
+            true => WITH_ACTOR,
+            false => CRITICS_ONLY,
+        }
     }
 
-    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, update: u64) -> Result<DeviceLosses> {
+    fn update(&self, graph: &mut Graph, batch: &DeviceBatch, variant: u64) -> Result<DeviceLosses> {
         let td3 = graph.config.algorithm.td3.clone();
-        let updates_actor = update.is_multiple_of(td3.actor_interval);
+        let updates_actor = variant == WITH_ACTOR;
 
         let next = graph.means(Of::Target, &batch.next_states)?;
         let clip = td3.target_noise_clip;
