@@ -10,6 +10,7 @@ import pathlib
 import signal
 import site
 import sys
+import time
 import threading
 
 import gymnasium
@@ -395,6 +396,14 @@ class Timed(Batch):
     def step_segment(self, actions, out: SegmentBuffers):
         super().step_segment(actions, out)
         out.truncated[:] = 1
+
+
+class Slow(Batch):
+    """Takes half a second for a segment."""
+
+    def step_segment(self, actions, out: SegmentBuffers):
+        time.sleep(0.5)
+        super().step_segment(actions, out)
 
 
 class ScaledBatch(Batch):

@@ -43,7 +43,7 @@ pub(super) enum Request {
     /// Receive segments until each worker has delivered one.
     FirstOfEach,
     /// Receive segments from a source for this time, and count them.
-    Measure(Duration, Source),
+    Measure(Duration, Source, Enough),
 }
 
 /// Workers whose segments are received.
@@ -53,6 +53,16 @@ pub(super) enum Source {
     All,
     /// The first worker; the others sleep once their queues are full.
     First,
+}
+
+/// What must have been received before a time is over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Enough {
+    /// Nothing, for example after the last segment of workers that have stopped.
+    Any,
+    /// A rate of zero would say that the workers do nothing, but a segment of a slow environment,
+    /// or on a busy machine, takes longer than a short measurement.
+    OneStep,
 }
 
 /// The receiver's answer to a request.
@@ -197,8 +207,8 @@ impl Drain {
         loop {
             let answer = match requests.recv_timeout(MAINTENANCE_INTERVAL) {
                 Ok(Request::FirstOfEach) => self.first_of_each().map(Answer::FirstOfEach),
-                Ok(Request::Measure(duration, source)) => {
-                    self.measure(duration, source).map(Answer::Measured)
+                Ok(Request::Measure(duration, source, enough)) => {
+                    self.measure(duration, source, enough).map(Answer::Measured)
                 }
                 Err(RecvTimeoutError::Timeout) => match self.maintain() {
                     Ok(()) => continue,
@@ -236,18 +246,30 @@ impl Drain {
         Ok(first.into_iter().flatten().collect())
     }
 
-    fn measure(&mut self, duration: Duration, source: Source) -> anyhow::Result<DrainWindow> {
-        self.take_for(SETTLE, source)?;
+    fn measure(
+        &mut self,
+        duration: Duration,
+        source: Source,
+        enough: Enough,
+    ) -> anyhow::Result<DrainWindow> {
+        self.take_for(SETTLE, source, Enough::Any)?;
         let cpu_s = thread_cpu_s();
-        let taken = self.take_for(duration, source)?;
+        let taken = self.take_for(duration, source, enough)?;
         Ok(DrainWindow { cpu_s: thread_cpu_s() - cpu_s, ..taken })
     }
 
-    /// Receives segments for `duration`. The result has the actual time.
-    fn take_for(&mut self, duration: Duration, source: Source) -> anyhow::Result<DrainWindow> {
+    /// Receives segments for `duration`, or for longer until there are enough. The result has the
+    /// actual time.
+    fn take_for(
+        &mut self,
+        duration: Duration,
+        source: Source,
+        enough: Enough,
+    ) -> anyhow::Result<DrainWindow> {
         let start = Instant::now();
         let (mut window, mut taken) = (DrainWindow::default(), 0);
-        while start.elapsed() < duration && !self.stop.load(Ordering::Acquire) {
+        let lacks = |window: &DrainWindow| enough == Enough::OneStep && window.env_steps == 0;
+        while (start.elapsed() < duration || lacks(&window)) && !self.stop.load(Ordering::Acquire) {
             match self.take(source)? {
                 Some(header) => {
                     window.segments += u64::from(header.steps_len > 0);

@@ -88,6 +88,19 @@ fn a_segment_env_of_ones_own_is_measured_alone() {
     }
 }
 
+/// A segment takes longer than the measurement, as it may on a busy machine.
+#[test]
+fn the_rate_of_a_slow_environment_is_not_zero() {
+    let place = Workplace::new();
+    let folder = dmprl_tests::tiny_envs_dir();
+    let more = ["--workers", "1", "--rounds", "2", "--json", "--python-path"];
+    let more = [&more[..], &[folder.to_str().unwrap()]].concat();
+    let json = bench(&place, "tiny_envs:Slow", &more).wait().with_status(0).json();
+    for round in json["rounds"]["worker"].as_array().unwrap() {
+        assert!(round.as_f64() > Some(0.0), "{json}");
+    }
+}
+
 #[test]
 fn a_gymnasium_class_of_ones_own_is_measured_beside_gymnasiums_loop() {
     let place = Workplace::new();
