@@ -2,7 +2,7 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
+use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store, tile_width};
 use super::{InstructionSet, PANEL, fill_panel, with_scratch};
 
 /// The product gradient * weights for the rows of a shard, from column `first` of the inputs on.
@@ -39,8 +39,8 @@ impl Backward<'_> {
         assert_eq!(self.inputs_gradient.len(), rows * width, "gradient of the inputs");
         let activations = self.activations.map_or(rows * width, <[f32]>::len);
         assert_eq!(activations, rows * width, "activations");
-        with_scratch(depth * PANEL, |panel| {
-            instructions.run(Job { layer: self, rows, width, inputs_len, column: 0, panel });
+        with_scratch(depth * 2 * PANEL, |panels| {
+            instructions.run(Job { layer: self, rows, width, inputs_len, column: 0, panels });
         });
     }
 }
@@ -50,10 +50,10 @@ struct Job<'a> {
     rows: usize,
     width: usize,
     inputs_len: usize,
-    /// First column of the current panel, relative to `first`.
+    /// First column of the current tiles, relative to `first`.
     column: usize,
-    /// The weights of the current panel, (outputs, [`PANEL`]).
-    panel: &'a mut [f32],
+    /// The weights of the current tiles: one or two panels, each (outputs, [`PANEL`]).
+    panels: &'a mut [f32],
 }
 
 impl WithSimd for Job<'_> {
@@ -62,11 +62,15 @@ impl WithSimd for Job<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         while self.column < self.width {
+            let width = tile_width::<S>(self.width - self.column);
             let first = self.layer.first + self.column;
-            let columns = first..self.inputs_len.min(first + PANEL);
-            fill_panel(self.layer.weights.chunks_exact(self.inputs_len), columns, self.panel);
-            for_rows(simd, 0..self.rows, &mut self);
-            self.column += PANEL;
+            let panels = self.panels.chunks_exact_mut(self.layer.outputs_len * PANEL);
+            for (first, panel) in (first..first + width).step_by(PANEL).zip(panels) {
+                let columns = first..self.inputs_len.min(first + PANEL);
+                fill_panel(self.layer.weights.chunks_exact(self.inputs_len), columns, panel);
+            }
+            for_rows(simd, 0..self.rows, width, &mut self);
+            self.column += width;
         }
     }
 }
@@ -76,13 +80,20 @@ impl<S: Simd> Tiled<S> for Job<'_> {
     fn tile<const M: usize, const V: usize>(&mut self, simd: S, row: usize) {
         let zero = simd.splat_f32s(0.0);
         let depth = self.layer.outputs_len;
-        let end = self.width.min(self.column + PANEL);
+        let width = V * S::F32_LANES;
+        let end = self.width.min(self.column + width);
         let left = Broadcast {
             data: &self.layer.gradient[row * depth..],
             row_stride: depth,
             depth_stride: 1,
         };
-        let right = Wide { data: self.panel, stride: PANEL, width: PANEL, next: None };
+        let right = Wide {
+            data: self.panels,
+            stride: PANEL,
+            panel_stride: depth * PANEL,
+            width,
+            next: None,
+        };
         let sums = accumulate::<S, M, V, false>(simd, [[zero; V]; M], left, right, depth);
         for (m, mut sums) in sums.into_iter().enumerate() {
             let at = (row + m) * self.width;

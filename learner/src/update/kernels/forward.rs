@@ -3,7 +3,7 @@
 use pulp::{Simd, WithSimd};
 
 use super::pack::{NARROW, packed_len};
-use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
+use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store, tile_width};
 use super::{InstructionSet, PANEL};
 
 /// The activation function of a layer.
@@ -51,7 +51,7 @@ struct Job<'a> {
     rows: usize,
     depth: usize,
     width: usize,
-    /// First column of the current panel.
+    /// First column of the current tiles.
     column: usize,
 }
 
@@ -63,10 +63,11 @@ impl WithSimd for Job<'_> {
         if self.width <= NARROW {
             return self.narrow(simd);
         }
-        // A panel stays in the first-level cache for all rows.
+        // The panels of a tile stay in the first- or second-level cache for all rows.
         while self.column < self.width {
-            for_rows(simd, 0..self.rows, &mut self);
-            self.column += PANEL;
+            let width = tile_width::<S>(self.width - self.column);
+            for_rows(simd, 0..self.rows, width, &mut self);
+            self.column += width;
         }
     }
 }
@@ -104,16 +105,21 @@ impl<S: Simd> Tiled<S> for Job<'_> {
     #[inline(always)]
     fn tile<const M: usize, const V: usize>(&mut self, simd: S, row: usize) {
         let Forward { inputs, packed, bias, activation, outputs } = &mut self.layer;
-        let end = self.width.min(self.column + PANEL);
+        let width = V * S::F32_LANES;
+        let end = self.width.min(self.column + width);
         let sums = [load::<S, V>(simd, &bias[self.column..end]); M];
         let left = Broadcast {
             data: &inputs[row * self.depth..],
             row_stride: self.depth,
             depth_stride: 1,
         };
-        let panel = &packed[self.column * self.depth..][..self.depth * PANEL];
-        let right =
-            Wide { data: panel, stride: PANEL, width: PANEL, next: Some(self.depth * PANEL) };
+        let right = Wide {
+            data: &packed[self.column * self.depth..][..self.depth * width],
+            stride: PANEL,
+            panel_stride: self.depth * PANEL,
+            width,
+            next: (row == 0).then_some(self.depth * width),
+        };
         let sums = accumulate::<S, M, V, false>(simd, sums, left, right, self.depth);
         let zero = simd.splat_f32s(0.0);
         for (m, mut sums) in sums.into_iter().enumerate() {

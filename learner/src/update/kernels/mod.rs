@@ -6,7 +6,7 @@
 //! | product                         | broadcast             | vectors                  |
 //! |---------------------------------|-----------------------|--------------------------|
 //! | [`Forward`]   Y = act(X Wᵀ + b) | X, by rows            | Wᵀ, in panels ([`pack`]) |
-//! | [`Backward`]  dX = dY W, masked | dY, by rows           | W, a panel at a time     |
+//! | [`Backward`]  dX = dY W, masked | dY, by rows           | W, copied into panels    |
 //! | [`WeightGradient`] dW = Σ dYᵀ X | dY, a panel at a time | X, not copied            |
 //!
 //! Therefore one register tile (`tile`) computes all of them. A panel is a copy of [`PANEL`]
@@ -44,7 +44,7 @@ use std::ops::Range;
 
 use pulp::{Arch, WithSimd};
 
-/// Outputs of a layer in one packed panel, and the width of every tile.
+/// Columns of a panel. A tile is one or two panels wide.
 pub const PANEL: usize = 16;
 
 /// The vector instructions that the kernels use. They affect rounding, so all threads of a run use

@@ -15,27 +15,30 @@ pub(super) struct Broadcast<'a> {
     pub depth_stride: usize,
 }
 
-/// The operand that is read as vectors: `width` numbers from `k * stride` on at depth `k`.
+/// The operand that is read as vectors. Column `c` and depth `k` are at
+/// `c / PANEL * panel_stride + k * stride + c % PANEL`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Wide<'a> {
     pub data: &'a [f32],
     pub stride: usize,
-    /// At most [`PANEL`].
+    pub panel_stride: usize,
+    /// Columns to read, at most those of the tile.
     pub width: usize,
-    /// Offset to the numbers that the next tiles read at the same depth, if they are to be
+    /// Offset to the numbers that the next columns' tiles read at the same depth, if they are to be
     /// prefetched: a network's weights do not stay in a core's caches from one shard to the next.
+    /// The first tile of some columns does it for the others.
     pub next: Option<usize>,
 }
 
-/// The sums of `M` rows and [`PANEL`] = `V` * lanes columns.
+/// The sums of `M` rows and `V` * lanes columns, which are one or two panels.
 pub(super) type Sums<S, const M: usize, const V: usize> = [[<S as Simd>::f32s; V]; M];
 
-/// Depths between two computations of all addresses. With 16 rows, addresses cost as many
-/// instructions as the products.
+/// Depths between two computations of all addresses. In a tile of 16 rows and one vector, addresses
+/// cost as many instructions as the products.
 const UNROLLED: usize = 4;
 
 /// Adds Σ_k left(m, k) right(k, ·), k < `depth`, to every row m of `sums`. With `MASKED`,
-/// `right.width` may be less than a panel; the other columns keep their sums.
+/// `right.width` may be less than the tile's; the other columns keep their sums.
 ///
 /// # Panics
 /// If an operand is too short.
@@ -47,15 +50,18 @@ pub(super) fn accumulate<S: Simd, const M: usize, const V: usize, const MASKED: 
     right: Wide<'_>,
     depth: usize,
 ) -> Sums<S, M, V> {
-    assert!(V * S::F32_LANES == PANEL, "vectors of a tile");
+    let tile_width = V * S::F32_LANES;
+    assert!(tile_width.is_multiple_of(PANEL), "vectors of a tile");
     if depth == 0 {
         return sums;
     }
     let left_last = (M - 1) * left.row_stride + (depth - 1) * left.depth_stride;
-    let width = if MASKED { right.width } else { PANEL };
+    let width = if MASKED { right.width } else { tile_width };
     assert!(left_last < left.data.len(), "left operand of a tile");
-    assert!(width <= PANEL, "a tile is {PANEL} wide");
-    assert!((depth - 1) * right.stride + width <= right.data.len(), "right operand of a tile");
+    assert!((1..=tile_width).contains(&width), "a tile is {tile_width} wide");
+    let last = width - 1;
+    let right_last = last / PANEL * right.panel_stride + (depth - 1) * right.stride + last % PANEL;
+    assert!(right_last < right.data.len(), "right operand of a tile");
     let masks = masks::<S, V>(simd, width);
     let mut k = 0;
     while k + UNROLLED <= depth {
@@ -76,7 +82,7 @@ pub(super) fn accumulate<S: Simd, const M: usize, const V: usize, const MASKED: 
 /// Adds left(m, k) right(k, ·) to every row m of `sums`.
 ///
 /// # Safety
-/// At depth k, `right` must have a panel or, if `MASKED`, the columns that `masks` select, and
+/// At depth k, `right` must have the tile's columns or, if `MASKED`, those that `masks` select, and
 /// `left` must have M rows.
 #[inline(always)]
 unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
@@ -92,7 +98,9 @@ unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
     for (v, vector) in vectors.iter_mut().enumerate() {
         // SAFETY: the caller guarantees the length of `right`.
         *vector = unsafe {
-            let at = right_at.add(k * right.stride).wrapping_add(v * S::F32_LANES);
+            let column = v * S::F32_LANES;
+            let offset = column / PANEL * right.panel_stride + column % PANEL;
+            let at = right_at.add(k * right.stride).wrapping_add(offset);
             if MASKED {
                 simd.mask_load_ptr_f32s(masks[v], at)
             } else {
@@ -101,7 +109,10 @@ unsafe fn multiply<S: Simd, const M: usize, const V: usize, const MASKED: bool>(
         };
     }
     if let Some(next) = right.next {
-        prefetch(right_at.wrapping_add(k * right.stride + next));
+        for panel in 0..V * S::F32_LANES / PANEL {
+            let offset = panel * right.panel_stride + k * right.stride + next;
+            prefetch(right_at.wrapping_add(offset));
+        }
     }
     let left_at = left.data.as_ptr();
     for (m, sums) in sums.iter_mut().enumerate() {
@@ -142,10 +153,10 @@ fn masks<S: Simd, const V: usize>(simd: S, width: usize) -> [MemMask<S::m32s>; V
 /// Loads the first `row.len()` columns of a tile's row; the others are zero.
 ///
 /// # Panics
-/// If `row` is longer than a panel.
+/// If `row` is wider than the tile.
 #[inline(always)]
 pub(super) fn load<S: Simd, const V: usize>(simd: S, row: &[f32]) -> [S::f32s; V] {
-    assert!(row.len() <= PANEL, "a tile is {PANEL} wide");
+    assert!(row.len() <= V * S::F32_LANES, "a row of {} columns in a tile", row.len());
     let masks = masks::<S, V>(simd, row.len());
     let mut values = [simd.splat_f32s(0.0); V];
     for (v, values) in values.iter_mut().enumerate() {
@@ -159,10 +170,10 @@ pub(super) fn load<S: Simd, const V: usize>(simd: S, row: &[f32]) -> [S::f32s; V
 /// Stores the first `row.len()` columns of a tile's row.
 ///
 /// # Panics
-/// If `row` is longer than a panel.
+/// If `row` is wider than the tile.
 #[inline(always)]
 pub(super) fn store<S: Simd, const V: usize>(simd: S, row: &mut [f32], values: [S::f32s; V]) {
-    assert!(row.len() <= PANEL, "a tile is {PANEL} wide");
+    assert!(row.len() <= V * S::F32_LANES, "a row of {} columns in a tile", row.len());
     if row.len() == V * S::F32_LANES {
         // Stores with a mask take tens of cycles on AMD's processors before AVX-512.
         for (v, values) in values.into_iter().enumerate() {
@@ -186,23 +197,36 @@ pub(super) trait Tiled<S: Simd> {
     fn tile<const M: usize, const V: usize>(&mut self, simd: S, row: usize);
 }
 
-/// Cuts `rows` into tiles of as many rows as the registers hold: 16 rows of one vector of 16
-/// numbers, 6 rows of two vectors of 8, or 4 rows of four vectors of 4. The number of rows changes
-/// no bit of the results.
+/// Returns the width of the tiles that compute the next of `left` columns: one panel, or two where
+/// a panel is one vector. A processor that multiplies two such vectors in a cycle also loads only
+/// two, and a tile of one vector loads a number of the left operand for each product.
 #[inline(always)]
-pub(super) fn for_rows<S: Simd, K: Tiled<S>>(simd: S, rows: Range<usize>, kernel: &mut K) {
+pub(super) fn tile_width<S: Simd>(left: usize) -> usize {
+    if S::F32_LANES == PANEL && left > PANEL { 2 * PANEL } else { PANEL }
+}
+
+/// Cuts `rows` into tiles of `width` columns ([`tile_width`]) and as many rows as the registers
+/// hold. The size of a tile changes no bit of the results.
+#[inline(always)]
+pub(super) fn for_rows<S: Simd, K: Tiled<S>>(
+    simd: S,
+    rows: Range<usize>,
+    width: usize,
+    kernel: &mut K,
+) {
     let mut row = rows.start;
     while row < rows.end {
-        row += match (S::F32_LANES, rows.end - row) {
-            (16, 16..) => run_tile::<S, K, 16, 1>(simd, row, kernel),
-            (16, 8..) => run_tile::<S, K, 8, 1>(simd, row, kernel),
-            (16, 4..) => run_tile::<S, K, 4, 1>(simd, row, kernel),
-            (16, 2..) => run_tile::<S, K, 2, 1>(simd, row, kernel),
-            (16, _) => run_tile::<S, K, 1, 1>(simd, row, kernel),
-            (8, 6..) => run_tile::<S, K, 6, 2>(simd, row, kernel),
-            (8, 4..) => run_tile::<S, K, 4, 2>(simd, row, kernel),
-            (8, 2..) => run_tile::<S, K, 2, 2>(simd, row, kernel),
-            (8, _) => run_tile::<S, K, 1, 2>(simd, row, kernel),
+        row += match (width / S::F32_LANES, rows.end - row) {
+            (1, 16..) => run_tile::<S, K, 16, 1>(simd, row, kernel),
+            (1, 8..) => run_tile::<S, K, 8, 1>(simd, row, kernel),
+            (1, 4..) => run_tile::<S, K, 4, 1>(simd, row, kernel),
+            (1, 2..) => run_tile::<S, K, 2, 1>(simd, row, kernel),
+            (1, _) => run_tile::<S, K, 1, 1>(simd, row, kernel),
+            (2, 8..) if S::F32_LANES == PANEL => run_tile::<S, K, 8, 2>(simd, row, kernel),
+            (2, 6..) => run_tile::<S, K, 6, 2>(simd, row, kernel),
+            (2, 4..) => run_tile::<S, K, 4, 2>(simd, row, kernel),
+            (2, 2..) => run_tile::<S, K, 2, 2>(simd, row, kernel),
+            (2, _) => run_tile::<S, K, 1, 2>(simd, row, kernel),
             (4, 4..) => run_tile::<S, K, 4, 4>(simd, row, kernel),
             (4, _) => run_tile::<S, K, 1, 4>(simd, row, kernel),
             _ => run_tile::<S, K, 1, PANEL>(simd, row, kernel),

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use pulp::{Simd, WithSimd};
 
-use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store};
+use super::tile::{Broadcast, Tiled, Wide, accumulate, for_rows, load, store, tile_width};
 use super::{InstructionSet, PANEL, fill_panel, with_scratch};
 
 /// Shards that a tile sums before it stores the result. They are collected first, because calling
@@ -94,7 +94,7 @@ struct Job<'a> {
     bias: &'a mut [f32],
     /// Whether the gradients already contain earlier shards.
     accumulate_onto: bool,
-    /// First column of the current panel.
+    /// First column of the current tiles.
     column: usize,
     /// The gradient of the current panel of outputs, (rows of all shards, [`PANEL`]).
     gradient: &'a mut [f32],
@@ -117,8 +117,9 @@ impl WithSimd for Job<'_> {
             fill_panel(rows, panel.clone(), self.gradient);
             self.column = 0;
             while self.column < self.inputs_len {
-                for_rows(simd, panel.clone(), &mut self);
-                self.column += PANEL;
+                let width = tile_width::<S>(self.inputs_len - self.column);
+                for_rows(simd, panel.clone(), width, &mut self);
+                self.column += width;
             }
         }
     }
@@ -156,7 +157,8 @@ impl<S: Simd> Tiled<S> for Job<'_> {
     #[inline(always)]
     fn tile<const M: usize, const V: usize>(&mut self, simd: S, row: usize) {
         let Self { inputs_len, outputs_len, .. } = *self;
-        let end = inputs_len.min(self.column + PANEL);
+        let tile_width = V * S::F32_LANES;
+        let end = inputs_len.min(self.column + tile_width);
         let width = end - self.column;
         let first = (row - self.outputs.start) * inputs_len;
         let columns = |m: usize| first + m * inputs_len + self.column..first + m * inputs_len + end;
@@ -166,16 +168,22 @@ impl<S: Simd> Tiled<S> for Job<'_> {
                 *sums = load::<S, V>(simd, &self.weights[columns(m)]);
             }
         }
-        let mut gradient = &self.gradient[(row - self.outputs.start) % PANEL..];
+        let first_row = (row - self.outputs.start) % PANEL;
+        let mut gradient = &self.gradient[first_row..];
         for shard in self.shards {
             let rows = shard.gradient.len() / outputs_len;
             if rows == 0 {
                 continue;
             }
             let left = Broadcast { data: gradient, row_stride: 1, depth_stride: PANEL };
-            let inputs = &shard.inputs[self.column..];
-            let right = Wide { data: inputs, stride: inputs_len, width, next: Some(PANEL) };
-            sums = if width == PANEL {
+            let right = Wide {
+                data: &shard.inputs[self.column..],
+                stride: inputs_len,
+                panel_stride: PANEL,
+                width,
+                next: (first_row == 0).then_some(tile_width),
+            };
+            sums = if width == tile_width {
                 accumulate::<S, M, V, false>(simd, sums, left, right, rows)
             } else {
                 accumulate::<S, M, V, true>(simd, sums, left, right, rows)
