@@ -10,8 +10,8 @@ import pathlib
 import signal
 import site
 import sys
-import time
 import threading
+import time
 
 import gymnasium
 import numpy as np

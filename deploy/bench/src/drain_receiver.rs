@@ -42,8 +42,10 @@ const ANSWER_POLL_INTERVAL: Duration = Duration::from_millis(20);
 pub(super) enum Request {
     /// Receive segments until each worker has delivered one.
     FirstOfEach,
-    /// Receive segments from a source for this time, and count them.
-    Measure(Duration, Source, Enough),
+    /// Receive segments from a source for this time, and count them. It takes longer until at least
+    /// `steps_min` steps have come: a rate of zero would say that the workers do nothing, but a
+    /// segment of a slow environment, or on a busy machine, takes longer than a short measurement.
+    Measure { duration: Duration, source: Source, steps_min: u64 },
 }
 
 /// Workers whose segments are received.
@@ -53,16 +55,6 @@ pub(super) enum Source {
     All,
     /// The first worker; the others sleep once their queues are full.
     First,
-}
-
-/// What must have been received before a time is over.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Enough {
-    /// Nothing, for example after the last segment of workers that have stopped.
-    Any,
-    /// A rate of zero would say that the workers do nothing, but a segment of a slow environment,
-    /// or on a busy machine, takes longer than a short measurement.
-    OneStep,
 }
 
 /// The receiver's answer to a request.
@@ -155,7 +147,7 @@ impl DrainReceiver {
                 Ok(answer) => return answer.context("the transport failed"),
                 Err(RecvTimeoutError::Disconnected) => bail!("the receiver's thread has exited"),
                 Err(RecvTimeoutError::Timeout) if Instant::now() >= deadline => {
-                    bail!("{request:?}: the workers delivered too little within {limit:?}")
+                    bail!("the workers delivered too few segments within {limit:?}")
                 }
                 Err(RecvTimeoutError::Timeout) => {}
             }
@@ -207,8 +199,8 @@ impl Drain {
         loop {
             let answer = match requests.recv_timeout(MAINTENANCE_INTERVAL) {
                 Ok(Request::FirstOfEach) => self.first_of_each().map(Answer::FirstOfEach),
-                Ok(Request::Measure(duration, source, enough)) => {
-                    self.measure(duration, source, enough).map(Answer::Measured)
+                Ok(Request::Measure { duration, source, steps_min }) => {
+                    self.measure(duration, source, steps_min).map(Answer::Measured)
                 }
                 Err(RecvTimeoutError::Timeout) => match self.maintain() {
                     Ok(()) => continue,
@@ -250,26 +242,27 @@ impl Drain {
         &mut self,
         duration: Duration,
         source: Source,
-        enough: Enough,
+        steps_min: u64,
     ) -> anyhow::Result<DrainWindow> {
-        self.take_for(SETTLE, source, Enough::Any)?;
+        self.take_for(SETTLE, source, 0)?;
         let cpu_s = thread_cpu_s();
-        let taken = self.take_for(duration, source, enough)?;
+        let taken = self.take_for(duration, source, steps_min)?;
         Ok(DrainWindow { cpu_s: thread_cpu_s() - cpu_s, ..taken })
     }
 
-    /// Receives segments for `duration`, or for longer until there are enough. The result has the
-    /// actual time.
+    /// Receives segments for `duration`, or for longer until there are `steps_min` steps. The
+    /// result has the actual time.
     fn take_for(
         &mut self,
         duration: Duration,
         source: Source,
-        enough: Enough,
+        steps_min: u64,
     ) -> anyhow::Result<DrainWindow> {
         let start = Instant::now();
         let (mut window, mut taken) = (DrainWindow::default(), 0);
-        let lacks = |window: &DrainWindow| enough == Enough::OneStep && window.env_steps == 0;
-        while (start.elapsed() < duration || lacks(&window)) && !self.stop.load(Ordering::Acquire) {
+        while (start.elapsed() < duration || window.env_steps < steps_min)
+            && !self.stop.load(Ordering::Acquire)
+        {
             match self.take(source)? {
                 Some(header) => {
                     window.segments += u64::from(header.steps_len > 0);

@@ -22,7 +22,7 @@ use tempfile::TempDir;
 
 use super::child::LineChild;
 use super::drain_receiver::{
-    Answer, Discrepancies, DrainReceiver, DrainWindow, Enough, Request, Source, show_warning,
+    Answer, Discrepancies, DrainReceiver, DrainWindow, Request, Source, show_warning,
 };
 use super::round::Round;
 
@@ -157,11 +157,8 @@ impl Workers {
         source: Source,
     ) -> anyhow::Result<(Round, DrainWindow)> {
         let (start, cpu_s) = (Instant::now(), self.cpu_s(source));
-        let answer = self.ask(
-            Request::Measure(duration, source, Enough::OneStep),
-            watch,
-            duration + MEASURE_SLACK,
-        )?;
+        let request = Request::Measure { duration, source, steps_min: 1 };
+        let answer = self.ask(request, watch, duration + MEASURE_SLACK)?;
         let Answer::Measured(window) = answer else {
             bail!("the receiver sent an unexpected answer");
         };

@@ -15,7 +15,7 @@ use dmprl_supervisor::create_domain;
 
 use crate::child::LineChild;
 use crate::drain_receiver::{
-    Answer, Discrepancies, DrainReceiver, DrainWindow, Enough, Request, Source, show_warning,
+    Answer, Discrepancies, DrainReceiver, DrainWindow, Request, Source, show_warning,
 };
 use crate::synthetic_segments::Size;
 
@@ -90,7 +90,7 @@ impl SharedMemory {
         watch: &Watch,
         duration: Duration,
     ) -> anyhow::Result<DrainWindow> {
-        let request = Request::Measure(duration, Source::All, Enough::Any);
+        let request = Request::Measure { duration, source: Source::All, steps_min: 0 };
         match self.ask(request, watch, duration + MEASURE_SLACK)? {
             Answer::Measured(window) => Ok(window),
             Answer::FirstOfEach(_) => bail!("the receiver sent an unexpected answer"),
@@ -114,11 +114,8 @@ impl SharedMemory {
         self.children.clear();
         let start = Instant::now();
         loop {
-            self.ask(
-                Request::Measure(DRAIN, Source::All, Enough::Any),
-                watch,
-                DRAIN + MEASURE_SLACK,
-            )?;
+            let request = Request::Measure { duration: DRAIN, source: Source::All, steps_min: 0 };
+            self.ask(request, watch, DRAIN + MEASURE_SLACK)?;
             if self.discrepancies.received >= sent || start.elapsed() >= DRAIN_MAX {
                 break;
             }
