@@ -74,6 +74,8 @@ pub(super) struct Workers {
     pub(super) spec: EnvSpec,
     pub(super) policy: Policy,
     pub(super) parameters: Vec<f32>,
+    /// Environment steps in a segment of each of a worker's environments.
+    steps_at_once: u64,
     /// Time from start to first delivered segment of the slowest worker [s].
     pub(super) first_segment_s: f64,
 }
@@ -118,6 +120,7 @@ impl Workers {
             receiver,
             discrepancies: Discrepancies::default(),
             spec,
+            steps_at_once: (config.actors.envs_per_worker * policy.layout().segment_steps) as u64,
             policy,
             parameters: snapshot.values,
             first_segment_s: 0.0,
@@ -157,7 +160,9 @@ impl Workers {
         source: Source,
     ) -> anyhow::Result<(Round, DrainWindow)> {
         let (start, cpu_s) = (Instant::now(), self.cpu_s(source));
-        let request = Request::Measure { duration, source, steps_min: 1 };
+        // A worker sends its environments' segments together, so fewer would be a part of them.
+        let steps_min = self.count(source) as u64 * self.steps_at_once;
+        let request = Request::Measure { duration, source, steps_min };
         let answer = self.ask(request, watch, duration + MEASURE_SLACK)?;
         let Answer::Measured(window) = answer else {
             bail!("the receiver sent an unexpected answer");
@@ -170,11 +175,15 @@ impl Workers {
     }
 
     fn cpu_s(&self, source: Source) -> Option<f64> {
-        let count = match source {
+        self.children.iter().take(self.count(source)).map(LineChild::cpu_s).sum()
+    }
+
+    /// Returns the number of workers of a source.
+    fn count(&self, source: Source) -> usize {
+        match source {
             Source::All => self.children.len(),
             Source::First => 1,
-        };
-        self.children.iter().take(count).map(LineChild::cpu_s).sum()
+        }
     }
 
     /// Rejected and lost segments so far.
