@@ -88,8 +88,27 @@ def make(kind, settings):
 
         size = env.action_space.shape
         arguments["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, NOISE))
+    if settings["algorithm"] is not None:
+        arguments |= ours(name, settings["algorithm"])
     agent = getattr(agents, name)("MlpPolicy", env, **arguments)
     return agent, evaluated, f"{module} {agents.__version__}"
+
+
+def ours(name, algorithm):
+    """Returns our settings as arguments of the library's algorithm."""
+    arguments = {
+        "policy_kwargs": {
+            "net_arch": {"pi": algorithm["hidden"], "qf": algorithm["critic_hidden"]}
+        },
+        "batch_size": algorithm["batch_size"],
+        "learning_rate": algorithm["learning_rate"],
+        "gamma": algorithm["discount"],
+        "train_freq": algorithm["steps"],
+        "gradient_steps": algorithm["updates"],
+    }
+    if name != "CrossQ":  # which has no target networks
+        arguments["tau"] = algorithm["polyak"]
+    return arguments
 
 
 def flattened(env):

@@ -51,7 +51,7 @@ const REACHER: TaskDefaults = TaskDefaults {
     episode_steps: 50,
     control_dt_s: 0.02,
     values: REACHER_VALUES,
-    over_presets: &[],
+    over_presets: &[("fast", REACHER_FAST)],
 };
 
 const PUSHER: TaskDefaults = TaskDefaults {
@@ -103,6 +103,7 @@ const PANDA_REACH_JOINTS: TaskDefaults = TaskDefaults {
     action_low: &[-1.0; 7],
     action_high: &[1.0; 7],
     values: PANDA_REACH_JOINTS_VALUES,
+    over_presets: &[("paper", PANDA_PAPER), ("fast", LEARNING_RATES_FAST)],
     ..PANDA_REACH
 };
 
@@ -400,6 +401,22 @@ actor_learning_rate = 0.0003
 warm_up_steps = 2000
 [replay]
 capacity_steps = 100000
+"#;
+
+// Small networks learn with a larger step.
+const LEARNING_RATES_FAST: &str = r#"
+[algorithm]
+critic_learning_rate = 0.002
+actor_learning_rate = 0.002
+"#;
+
+const REACHER_FAST: &str = r#"
+[policy]
+hidden = [128, 128]
+[algorithm]
+critic_hidden = [128, 128]
+critic_learning_rate = 0.002
+actor_learning_rate = 0.002
 "#;
 
 // docs/decisions/0107-discount-with-goals.md

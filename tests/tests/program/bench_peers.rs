@@ -5,9 +5,9 @@ use std::process::Command;
 
 use dmprl_tests::program::{Running, Workplace, executable};
 
-/// Answers as `tests/peers/agent_peer.py` does.
+/// Answers as `tests/peers/agent_peer.py` does, with the batch size of its settings as description.
 const PEER: &str = r#"#!/bin/sh
-echo '{"ready": "a stand-in"}'
+echo '{"ready": "'$(grep -o 'batch_size":[0-9]*' "$4" | tr -d '"')'"}'
 echo '{"ended": false, "env_steps": 50, "value": -2e9, "start_s": 0.5, "evaluation_s": 0.1}'
 echo '{"ended": true, "env_steps": 100, "value": -3.0, "start_s": 0.5, "evaluation_s": 0.2}'
 "#;
@@ -23,12 +23,18 @@ fn bench(place: &Workplace, peer_python: &str, more: &[&str]) -> Running {
     place.start_command(command)
 }
 
-#[test]
-fn each_seed_is_trained_until_the_target_by_all() {
-    let place = Workplace::new();
+/// Returns the path of an interpreter that runs `PEER` instead of a script.
+fn stand_in(place: &Workplace) -> String {
     let python = place.path("python");
     std::fs::write(&python, PEER).unwrap();
     std::fs::set_permissions(&python, PermissionsExt::from_mode(0o700)).unwrap();
+    python
+}
+
+#[test]
+fn each_seed_is_trained_until_the_target_by_all() {
+    let place = Workplace::new();
+    let python = stand_in(&place);
     let target = ["--until-return", "-1e6", "--seeds", "2", "--peer", "sbx-sac", "--json"];
     let finished = bench(&place, &python, &target).wait().with_status(0);
     let json = finished.json();
@@ -45,6 +51,20 @@ fn each_seed_is_trained_until_the_target_by_all() {
     assert!(json["candidates"]["sbx-sac"]["ratio"].as_f64() < Some(1.0), "{json}");
     place.assert_no_process();
     assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
+}
+
+#[test]
+fn a_peer_has_its_own_settings_unless_ours_are_asked_for() {
+    for (more, note) in [(&[][..], ""), (&["--equal-settings"][..], "batch_size:32")] {
+        let place = Workplace::new();
+        let python = stand_in(&place);
+        let batch = ["--set", "algorithm.batch_size=32"];
+        let target = ["--until-return", "-1e6", "--seeds", "1", "--peer", "sb3-sac", "--json"];
+        let finished = bench(&place, &python, &[&batch[..], &target[..], more].concat()).wait();
+        let json = finished.with_status(0).json();
+        assert_eq!(json["equal_settings"], !more.is_empty(), "{json}");
+        assert_eq!(json["candidates"]["sb3-sac"]["note"], note, "{json}");
+    }
 }
 
 #[test]

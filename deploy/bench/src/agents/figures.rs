@@ -15,6 +15,7 @@ const OURS: &str = "ours";
 #[derive(Debug, Clone)]
 pub struct Figures {
     config: ExperimentConfig,
+    equal_settings: bool,
     machine: Machine,
     load_average: Option<f64>,
     candidates: Vec<Candidate>,
@@ -55,6 +56,7 @@ impl Figures {
         let candidate = |kind| Candidate { kind, trainings: Vec::new(), note: None };
         Self {
             config: bench.config.clone(),
+            equal_settings: bench.equal_settings,
             machine,
             load_average: load_average(),
             candidates: kinds.map(candidate).collect(),
@@ -129,6 +131,7 @@ impl Figures {
             "evaluation_interval_steps": self.config.evaluation.interval_steps,
             "max_minutes": self.config.run.max_minutes,
             "steps_max": self.config.run.steps,
+            "equal_settings": self.equal_settings,
             "candidates": candidates,
             "cpu": self.machine.cpu,
             "cores": self.machine.cores,
@@ -142,11 +145,12 @@ impl Figures {
         let target = Target::of(&self.config);
         let mut lines = vec![
             format!(
-                "{} · {} of {} episodes at least {} · {}, {} cores",
+                "{} · {} of {} episodes at least {} · peers with {} · {}, {} cores",
                 self.config.task.name,
                 target.name(),
                 self.config.evaluation.episodes,
                 target.value,
+                if self.equal_settings { "our settings" } else { "their defaults" },
                 self.machine.cpu.as_deref().unwrap_or("unknown processor"),
                 self.machine.cores
             ),

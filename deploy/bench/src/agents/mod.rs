@@ -31,6 +31,8 @@ pub struct AgentsBench {
     pub config: ExperimentConfig,
     /// The peers.
     pub peers: Vec<AgentKind>,
+    /// Whether the peers have our settings instead of their libraries' defaults.
+    pub equal_settings: bool,
     /// Number of seeds, beginning with the configured one.
     pub seeds: u64,
     /// Python interpreter of the peers.

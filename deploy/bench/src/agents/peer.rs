@@ -7,14 +7,14 @@ use std::process::Command;
 use anyhow::Context;
 use clap::ValueEnum;
 use dmprl_run::Watch;
-use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::config::{ExperimentConfig, PolicyKind};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::{AgentsBench, Target, Training, limit};
 use crate::child::LineChild;
 
-/// An algorithm of another library, with its default settings.
+/// An algorithm of another library.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
 pub enum AgentKind {
     /// TD3 of Stable-Baselines3 (PyTorch).
@@ -63,7 +63,7 @@ pub(super) fn train(
 ) -> anyhow::Result<Result<(String, Training), String>> {
     std::fs::create_dir(place).with_context(|| format!("cannot make {}", place.display()))?;
     let (settings, log) = (place.join("settings.json"), place.join("log"));
-    std::fs::write(&settings, settings_of(config).to_string())
+    std::fs::write(&settings, settings_of(config, bench.equal_settings).to_string())
         .with_context(|| format!("cannot write {}", settings.display()))?;
     let errors = File::create(&log).with_context(|| format!("cannot make {}", log.display()))?;
     let mut command = Command::new(&bench.peer_python);
@@ -104,7 +104,7 @@ pub(super) fn train(
     }
 }
 
-fn settings_of(config: &ExperimentConfig) -> Value {
+fn settings_of(config: &ExperimentConfig, equal: bool) -> Value {
     let target = Target::of(config);
     json!({
         "task": config.task.id,
@@ -119,5 +119,26 @@ fn settings_of(config: &ExperimentConfig) -> Value {
         "first_seed": config.evaluation.first_seed,
         "by_success": target.is_success,
         "target": target.value,
+        "algorithm": equal.then(|| algorithm_of(config)),
+    })
+}
+
+/// Our settings, for any algorithm of a peer. A peer has one learning rate; it gets that of our
+/// critics. It decides at every step, so it gets the updates of a segment after as many steps.
+fn algorithm_of(config: &ExperimentConfig) -> Value {
+    let algorithm = &config.algorithm;
+    let steps = match config.policy.kind {
+        PolicyKind::Mlp => 1,
+        PolicyKind::Dmp | PolicyKind::Chunk => config.policy.segment_steps,
+    };
+    json!({
+        "hidden": config.policy.hidden,
+        "critic_hidden": algorithm.critic_hidden,
+        "batch_size": algorithm.batch_size,
+        "learning_rate": algorithm.critic_learning_rate,
+        "discount": algorithm.discount,
+        "polyak": algorithm.polyak,
+        "steps": steps,
+        "updates": config.pacing.updates_per_segment.round().max(1.0) as u64,
     })
 }

@@ -18,8 +18,8 @@ const HELP: &str = "\
 Trains one seed after another with each candidate, in turns, until an evaluation reaches the target.
 The time runs from the start of the process, imports included. Ours is a whole `dmprl train`, up to
 its end. A peer has one environment, the CPU, and its library's default settings (TD3: with Gaussian
-noise of 0.1). All have the same number of steps before the first update, and the same interval,
-episodes and seeds of evaluations.
+noise of 0.1), or ours with --equal-settings. All have the same number of steps before the first
+update, and the same interval, episodes and seeds of evaluations.
 Without --peer-python, the peers' packages are installed into .venv-peers on first use.
 Ctrl-C stops the benchmark and removes its processes and trainings.
 
@@ -27,7 +27,8 @@ EXAMPLES
   dmprl bench peers --task reacher --until-return -5.2 --preset fast
   dmprl bench peers --task panda-reach-joints --until-success 0.99 --preset fast --seeds 3
   dmprl bench peers --task HalfCheetah-v5 --policy mlp --until-return 3000 --steps 200000 \\
-      --max-minutes 60 --peer sb3-td3 --peer sbx-crossq --json";
+      --max-minutes 60 --peer sb3-td3 --peer sbx-crossq --json
+  dmprl bench peers --task pusher --until-return -34 --preset fast --equal-settings";
 
 /// Arguments of `dmprl bench peers`.
 #[derive(Debug, Args)]
@@ -59,6 +60,10 @@ pub(super) struct PeersArgs {
     /// Algorithm of another library; repeatable.
     #[arg(long, value_enum, default_values = ["sb3-td3", "sbx-td3"])]
     peer: Vec<AgentKind>,
+    /// Give the peers our networks, batch size, learning rate, discount, Polyak factor and updates
+    /// per step instead of their libraries' defaults.
+    #[arg(long)]
+    equal_settings: bool,
     /// Python interpreter with stable-baselines3 and sbx-rl [default: that of .venv-peers].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
@@ -101,6 +106,7 @@ pub(super) fn run(args: &PeersArgs) -> anyhow::Result<Outcome> {
         program: this_program()?,
         config,
         peers,
+        equal_settings: args.equal_settings,
         seeds: args.seeds,
         peer_python: match peer_python {
             Some(python) => python,

@@ -32,6 +32,24 @@ fn tasks_of_the_panda_with_objects_have_their_own_discount_in_preset_goal() {
 }
 
 #[test]
+fn easy_tasks_have_small_networks_and_larger_steps_in_preset_fast() {
+    let fast = PRESETS.iter().position(|preset| preset.name == "fast").unwrap();
+    for (name, hidden, learning_rate) in [
+        ("reacher", 128, 0.002),
+        ("reacher-v1", 128, 0.002),
+        ("panda-reach-joints", 128, 0.002),
+        ("pusher", 256, 0.001),
+    ] {
+        let config = config(name, fast);
+        assert_eq!(config.policy.hidden, [hidden; 2], "{name}");
+        let algorithm = config.algorithm;
+        assert_eq!((algorithm.critic_hidden, algorithm.batch_size), (vec![hidden; 2], 128));
+        let rates = [algorithm.critic_learning_rate, algorithm.actor_learning_rate];
+        assert_eq!(rates, [learning_rate; 2], "{name}");
+    }
+}
+
+#[test]
 fn preset_paper_uses_the_panda_column_of_table_2() {
     for (name, discount, actor, warm_up, capacity) in [
         ("reacher-v1", 0.99, 5e-4, 10_000, 1_000_000),
