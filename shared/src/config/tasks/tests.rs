@@ -37,7 +37,7 @@ fn easy_tasks_have_small_networks_and_larger_steps_in_preset_fast() {
     for (name, hidden, learning_rate) in [
         ("reacher", 128, 0.002),
         ("reacher-v1", 128, 0.002),
-        ("panda-reach-joints", 128, 0.002),
+        ("panda-reach-joints", 64, 0.002),
         ("pusher", 256, 0.001),
     ] {
         let config = config(name, fast);
