@@ -29,7 +29,7 @@ fn positive(json: &Value, key: &str) {
 #[test]
 fn every_algorithm_with_every_policy_is_measured_beside_its_floor() {
     let place = Workplace::new();
-    for algorithm in ["ddpg", "td3", "sac"] {
+    for algorithm in ["ddpg", "td3", "sac", "tqc"] {
         for policy in ["dmp", "mlp"] {
             let more = ["--task", "reacher", "--algo", algorithm, "--policy", policy];
             let more = [&more[..], &["--threads", "2", "--rounds", "2", "--json"]].concat();

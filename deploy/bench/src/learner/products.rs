@@ -1,4 +1,4 @@
-//! Lists the matrix products of an update of DDPG, TD3 and SAC, whose time is the floor.
+//! Lists the matrix products of an update of DDPG, TD3, SAC and TQC, whose time is the floor.
 
 use dmprl_learner::algorithms::BatchShape;
 use dmprl_learner::learner::Learner;
@@ -92,8 +92,16 @@ impl Cycle {
             &network.expect("every algorithm has an actor and a critic").1.shape
         };
         let batch = off_policy.algorithm.batch_shape();
-        let networks = Networks { actor: shape("actor"), critic: shape("critic"), batch };
         let config = &learner.config().algorithm;
+        let critic = match config.name {
+            // Its critics have no shape of ours: a graph computes them.
+            AlgorithmName::Tqc => &MlpShape::new(
+                [&[batch.critic_width()], &config.critic_hidden[..], &[config.tqc.quantiles]]
+                    .concat(),
+            ),
+            _ => shape("critic"),
+        };
+        let networks = Networks { actor: shape("actor"), critic, batch };
         match config.name {
             AlgorithmName::Ddpg => {
                 one_update([networks.critics_step(1), networks.actor_step(1)].concat())
@@ -106,7 +114,11 @@ impl Cycle {
                 let critics = networks.critics_step(2).repeat(updates as usize);
                 Self { products: [critics, networks.actor_step(1)].concat(), updates }
             }
-            AlgorithmName::Tqc | AlgorithmName::Ndp => one_update(Vec::new()),
+            AlgorithmName::Tqc => {
+                let critics = config.tqc.critics;
+                one_update([networks.critics_step(critics), networks.actor_step(critics)].concat())
+            }
+            AlgorithmName::Ndp => one_update(Vec::new()),
         }
     }
 }
@@ -189,5 +201,11 @@ mod tests {
         let two = actor_forward + 2 * (forward + learn);
         let actor_learn = 2 * actor_forward + actor_back;
         assert_eq!(multiplications("sac"), (two + 2 * actions_gradient + actor_learn, 1));
+        // TQC has SAC's actor and two critics 6-100-25.
+        let (forward, back) = (600 + 2500, 2500);
+        let learn = forward + back + (600 + 2500);
+        let actions_gradient = forward + back + 200;
+        let two = actor_forward + 2 * (forward + learn);
+        assert_eq!(multiplications("tqc"), (two + 2 * actions_gradient + actor_learn, 1));
     }
 }

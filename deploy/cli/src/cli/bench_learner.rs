@@ -107,12 +107,12 @@ pub(super) fn run(args: &LearnerArgs) -> anyhow::Result<Outcome> {
     if config.algorithm.name == AlgorithmName::Ndp {
         return Err(wrong_use(
             "--algo ndp: it learns from whole rollouts, not from batches of a replay; expected \
-             ddpg, td3 or sac",
+             ddpg, td3, sac or tqc",
         ));
     }
-    if config.algorithm.name.is_graph_only() {
+    if config.algorithm.name.is_graph_only() && !args.peer.is_empty() {
         return Err(wrong_use(format!(
-            "--algo {}: it has no kernels to compare with a floor; expected ddpg, td3 or sac",
+            "--peer with --algo {}: the peers have only ddpg, td3 and sac",
             config.algorithm.name.name()
         )));
     }
