@@ -39,9 +39,8 @@ pub const PRESETS: [Preset; 4] = [
     },
 ];
 
-// A batch of 128 halves the time of an update and, with as many updates, loses less than half of
-// what it teaches (docs/decisions/0118-smaller-batches-in-fast.md). Tasks that smaller networks can
-// learn have their own values over this (`tasks.rs`).
+// An update with a batch of 128 takes half the time, and good policies come sooner
+// (docs/decisions/0118-smaller-batches-in-fast.md). Easy tasks have smaller networks (`tasks.rs`).
 const FAST: &str = r#"
 [algorithm]
 batch_size = 128

@@ -84,6 +84,13 @@ fn a_task_whose_sizes_are_not_known_is_refused() {
     finished.saying("sizes").saying("reacher");
 }
 
+#[test]
+fn an_algorithm_that_the_peers_do_not_have_is_refused() {
+    let place = Workplace::new();
+    let more = ["--task", "reacher", "--algo", "tqc", "--peer", "torch"];
+    bench(&place, &more).wait().with_status(2).saying("--peer with --algo tqc");
+}
+
 /// The tests' program is built without the feature `cuda`.
 #[test]
 fn a_build_without_cuda_refuses_a_gpu_and_names_the_remedy() {
