@@ -1,18 +1,25 @@
-//! Penalties on changes of the actions in the actor's loss: on their rate and their acceleration.
+//! Penalties in the actor's loss: on the rate and the acceleration of the actions, and on
+//! saturation.
 //!
-//! They are sums over a decision's noise-free actions and their dimensions. u_{t-1} and u_{t-2} are
-//! read from the replay; terms with an action that does not exist are absent.
+//! The first two are sums over a decision's noise-free actions and their dimensions. u_{t-1} and
+//! u_{t-2} are read from the replay; terms with an action that does not exist are absent. The third
+//! is a sum over everything that gets a tanh: the head's outputs and the means.
 //!     rate:          sum (u_k - u_{k-1})²
 //!     acceleration:  sum (u_k - 2 u_{k-1} + u_{k-2})²
+//!     saturation:    sum max(|x_i| - 2, 0)²
 //! Weights are relative to the batch's mean |Q|, so they do not depend on the scale of rewards.
 
 use dmprl_shared::config::AlgorithmConfig;
 
-/// Weights of both penalties, in units of Q once they are multiplied by |Q|.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// Largest |x| before a tanh without a penalty on saturation. tanh(2) is 0.96, its slope 0.07.
+pub const UNSATURATED_MAX: f32 = 2.0;
+
+/// Weights of the penalties, in units of Q once they are multiplied by |Q|.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ActionPenalties {
     rate: f32,
     acceleration: f32,
+    saturation: f32,
 }
 
 /// One row's actions, and those before them.
@@ -33,23 +40,44 @@ impl ActionPenalties {
         Self {
             rate: config.action_rate_penalty as f32,
             acceleration: config.action_acceleration_penalty as f32,
+            saturation: config.saturation_penalty as f32,
         }
     }
 
     /// Returns the weights in units of Q, for a batch with this mean |Q|.
     #[must_use]
     pub fn of(self, q_size: f32) -> Self {
-        Self { rate: self.rate * q_size, acceleration: self.acceleration * q_size }
+        Self {
+            rate: self.rate * q_size,
+            acceleration: self.acceleration * q_size,
+            saturation: self.saturation * q_size,
+        }
     }
 
-    /// Returns whether there is nothing to add.
+    /// Returns whether changes of the actions cost nothing.
     #[must_use]
-    pub fn is_none(self) -> bool {
-        self == Self { rate: 0.0, acceleration: 0.0 }
+    pub fn ignore_changes(self) -> bool {
+        (self.rate, self.acceleration) == (0.0, 0.0)
     }
 
-    /// Returns the penalty of a row. Adds its gradient with respect to action `i`, multiplied by
-    /// `slope(i)`, to `gradient`, (K, A).
+    /// Returns the penalty on the saturation of some values before their tanh. Adds its gradient,
+    /// divided by `rows`, to `gradient`.
+    pub fn add_saturation(self, values: &[f32], gradient: &mut [f32], rows: f32) -> f32 {
+        if self.saturation == 0.0 {
+            return 0.0;
+        }
+        let slope = 2.0 * self.saturation / rows;
+        let mut sum = 0.0;
+        for (value, gradient) in values.iter().zip(gradient) {
+            let excess = (value.abs() - UNSATURATED_MAX).max(0.0);
+            sum += excess * excess;
+            *gradient += slope * excess.copysign(*value);
+        }
+        self.saturation * sum
+    }
+
+    /// Returns the penalty on the changes in a row. Adds its gradient with respect to action `i`,
+    /// multiplied by `slope(i)`, to `gradient`, (K, A).
     pub fn add(
         self,
         row: ActionRow<'_>,
@@ -100,7 +128,7 @@ mod tests {
             has_previous,
         };
         let penalty = |rate, acceleration, has_previous| {
-            let penalties = ActionPenalties { rate, acceleration };
+            let penalties = ActionPenalties { rate, acceleration, saturation: 0.0 };
             penalties.add(row(has_previous), &mut [0.0; 6], |_| 1.0)
         };
         for (got, expected) in [
@@ -114,5 +142,14 @@ mod tests {
         ] {
             assert!((got - expected).abs() < 1e-6, "{got} {expected}");
         }
+    }
+
+    #[test]
+    fn saturation_costs_nothing_up_to_2_and_the_square_beyond() {
+        let penalties = ActionPenalties { rate: 0.0, acceleration: 0.0, saturation: 0.5 };
+        let mut gradient = [1.0; 5];
+        let sum = penalties.add_saturation(&[0.0, -2.0, 2.5, -4.0, 3.0], &mut gradient, 4.0);
+        assert!((sum - 0.5 * (0.25 + 4.0 + 1.0)).abs() < 1e-6, "{sum}");
+        assert_eq!(gradient, [1.0, 1.0, 1.125, 0.5, 1.25]);
     }
 }

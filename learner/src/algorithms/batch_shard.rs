@@ -288,7 +288,7 @@ impl BatchShard {
         self.unsquash();
         self.penalise(policy, penalties, batch);
         self.log_stds_backward(policy, |_, _, _| 0.0);
-        self.actor_backward(policy, actor);
+        self.actor_backward(policy, actor, penalties);
     }
 
     /// Runs the passes of the loss mean (pi(s) - u)², where u, (B, K A), are the `actions` to
@@ -312,7 +312,7 @@ impl BatchShard {
         self.end_gradient.fill(0.0);
         self.unsquash();
         self.log_stds_backward(policy, |_, _, _| 0.0);
-        self.actor_backward(policy, actor);
+        self.actor_backward(policy, actor, ActionPenalties::default());
     }
 
     fn add_input_gradient(&mut self) {
@@ -341,7 +341,7 @@ impl BatchShard {
     /// Adds the penalties on changes of tanh(means) to the actor's loss and its gradient. Call it
     /// after [`BatchShard::unsquash`]. Sets the actions to tanh(means).
     pub fn penalise(&mut self, policy: &Policy, penalties: ActionPenalties, batch: &Batch) {
-        if penalties.is_none() {
+        if penalties.ignore_changes() {
             return;
         }
         let BatchShape { action_len: dims, segment_actions_len: len, .. } = self.shape;
@@ -378,9 +378,19 @@ impl BatchShard {
     }
 
     /// Runs the actor's backward pass from the gradient with respect to the means, in
-    /// `actions_gradient`, and to the log-stds.
-    pub fn actor_backward(&mut self, policy: &Policy, actor: &NetworkView<'_>) {
+    /// `actions_gradient`, and to the log-stds. Adds the penalty on saturation to the loss and its
+    /// gradient.
+    pub fn actor_backward(
+        &mut self,
+        policy: &Policy,
+        actor: &NetworkView<'_>,
+        penalties: ActionPenalties,
+    ) {
         let rows = self.rows_len();
+        if policy.squashes() {
+            let (means, gradient) = (&self.policy.means, &mut self.actions_gradient);
+            self.sums.actor += penalties.add_saturation(means, gradient, self.batch_rows);
+        }
         let stride = policy.shape().outputs();
         let outputs = self.actor_gradients.output_mut(policy.shape(), rows);
         match (policy.head(), &mut self.policy.dmp) {
@@ -388,6 +398,15 @@ impl BatchShard {
                 let gradient =
                     HeadGradient { means: &self.actions_gradient, end_state: &self.end_gradient };
                 head.backward(dmp, gradient, outputs, stride);
+                let values = self.policy.activations.output(policy.shape(), rows);
+                let pairs = values.chunks_exact(stride).zip(outputs.chunks_exact_mut(stride));
+                for (values, gradient) in pairs {
+                    for range in head.squashed_outputs() {
+                        let (values, gradient) = (&values[range.clone()], &mut gradient[range]);
+                        self.sums.actor +=
+                            penalties.add_saturation(values, gradient, self.batch_rows);
+                    }
+                }
             }
             _ => {
                 let dims = self.shape.segment_actions_len;

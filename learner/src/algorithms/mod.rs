@@ -4,7 +4,7 @@
 //! those that only `graph` has. NDP ([`ndp`]) learns from rollouts. [`crate::regime`] selects
 //! between the two.
 
-mod action_penalties;
+pub mod action_penalties;
 pub(crate) mod batch;
 mod batch_shard;
 pub mod cloning;

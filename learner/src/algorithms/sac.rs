@@ -16,7 +16,8 @@
 //! 4. Squared errors without the factor one half; PyTorch's initialisation.
 //! 5. A time limit is not a termination: truncated episodes bootstrap.
 //! 6. With policy `dmp` the actor's loss has penalties on changes of its means
-//!    (`action_rate_penalty`, `action_acceleration_penalty`).
+//!    (`action_rate_penalty`, `action_acceleration_penalty`). One on saturation is optional
+//!    (`saturation_penalty`).
 //! 7. Learning rates of networks come from the configuration (1e-3 instead of 3e-4); that of the
 //!    temperature is 3e-4. Two updates per segment are 0.4 per environment step instead of 1.
 //!    Observations are normalised.
@@ -200,7 +201,7 @@ impl Sac {
             // The penalties are on the means, which act without exploration, whose noise need not
             // be smooth.
             shard.penalise(policy, penalties, batch);
-            shard.actor_backward(policy, &actor);
+            shard.actor_backward(policy, &actor, penalties);
         });
         drop((actor, critics));
         self.actor.adam_step(pool, &self.shards, |shard| shard.actor_record(batch), None);

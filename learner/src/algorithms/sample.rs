@@ -27,8 +27,7 @@ impl<'a> Sample<'a> {
             None => sampler.draw(replay)?,
         };
         let drawn = hindsight.and_then(|hindsight| {
-            let row = hindsight.draw(replay, &window, sampler.random_mut())?;
-            let goal = replay.achieved_goal(&hindsight.rule, row);
+            let goal = hindsight.draw(replay, &window, sampler.random_mut())?;
             let outcome = replay.outcome(&window, goal)?;
             Some(Self { window, outcome, goal: Some(goal), hindsight: Some(hindsight) })
         });

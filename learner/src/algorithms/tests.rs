@@ -10,6 +10,7 @@ use rand::RngExt;
 use super::*;
 use crate::learner::tests::{goal_rule, spec};
 use crate::parameters::Parameters;
+use crate::update::network::TrainableNetwork;
 
 pub(super) struct Case {
     config: ExperimentConfig,
@@ -180,6 +181,27 @@ fn an_update_equals_automatic_differentiation() {
         for keys in cases {
             let all: Vec<_> = keys.iter().copied().chain([("algorithm.name", algorithm)]).collect();
             case(&all).check(&format!("{algorithm} {keys:?}"));
+        }
+    }
+}
+
+#[test]
+fn a_saturated_actor_is_penalised_as_by_automatic_differentiation() {
+    let cases: [&[(&str, &str)]; 3] =
+        [&[], &[("policy.kind", "chunk")], &[("policy.rho", "free"), ("policy.start", "carry")]];
+    for algorithm in ["ddpg", "td3", "sac"] {
+        for keys in cases {
+            let own = [("algorithm.name", algorithm), ("algorithm.saturation_penalty", "0.7")];
+            let all: Vec<_> = keys.iter().copied().chain(own).collect();
+            let mut saturated = case(&all);
+            let grow = |name: &str, network: &mut TrainableNetwork| {
+                if name == "actor" {
+                    network.parameters.values_mut().iter_mut().for_each(|value| *value *= 4.0);
+                }
+                Ok::<(), std::convert::Infallible>(())
+            };
+            saturated.algorithm.for_each_network(grow).unwrap();
+            saturated.check(&format!("{algorithm} {keys:?}"));
         }
     }
 }

@@ -317,8 +317,8 @@ impl Graph {
         CriticStep::new(sum, first_q)
     }
 
-    /// Does an actor step on -Q(s, pi(s)) of one critic, plus the penalties on changes of actions,
-    /// and moves the actor's target. Returns the loss.
+    /// Does an actor step on -Q(s, pi(s)) of one critic, plus the penalties, and moves the actor's
+    /// target. Returns the loss.
     fn policy_gradient_step(
         &mut self,
         critic: &str,
@@ -329,13 +329,24 @@ impl Graph {
         let u = means.means.tanh()?;
         let inputs = self.critic_inputs(&batch.states, &means.with_end_state(&u)?)?;
         let q = self.forward(critic, Of::Frozen, &inputs)?.mean_all()?;
-        let loss = (self.action_penalties(&u, batch, q_size)? - q)?;
+        let loss = (self.penalties(&means, batch, q_size)? - q)?;
         self.descend("actor", &loss, true)?;
         Ok(loss)
     }
 
-    /// Returns the penalties on changes of the actions u, (B, K A), on their rate and on their
-    /// acceleration: sums of squares, as means over the batch and shares of |Q|.
+    /// Returns the penalties on a policy's decisions: on the rate and the acceleration of its
+    /// actions, and on saturation. They are sums of squares, as means over the batch and shares of
+    /// |Q|.
+    fn penalties(&self, means: &Means, batch: &DeviceBatch, q_size: &Tensor) -> Result<Tensor> {
+        let weight = self.config.algorithm.saturation_penalty;
+        let changes = self.action_penalties(&means.means.tanh()?, batch, q_size)?;
+        if weight == 0.0 {
+            return Ok(changes);
+        }
+        changes + (means.saturation()?.mul(q_size)? * weight)?
+    }
+
+    /// Returns the penalties on changes of the actions u, (B, K A).
     fn action_penalties(&self, u: &Tensor, batch: &DeviceBatch, q_size: &Tensor) -> Result<Tensor> {
         let dims = self.shape.action_len;
         let changes_of = |x: &Tensor| {

@@ -6,6 +6,7 @@ use dmprl_shared::dmp::{Dmp, SegmentMap};
 use dmprl_shared::policy::{Head, MlpShape, Policy};
 
 use super::batch::needed;
+use crate::algorithms::action_penalties::UNSATURATED_MAX;
 use crate::update::kernels::VARIANCE_EPSILON;
 
 /// Range of a raw log-std, as in `dmprl_shared::policy::gaussian`.
@@ -42,6 +43,8 @@ pub(super) struct Means {
     pub means: Tensor,
     /// (y_K, yd_K / omega), (B, 2A), if the critic sees it.
     pub end_state: Option<Tensor>,
+    /// The head's outputs that get a tanh, if they are not the means.
+    squashed_outputs: Option<Tensor>,
     /// SAC's log-stds before clamping, (B, K A).
     raw_log_stds: Option<Tensor>,
 }
@@ -101,11 +104,14 @@ impl PolicyGraph {
         let raw_log_stds = columns.map(|c| outputs.narrow(1, c.start, c.len())).transpose()?;
         let head_len = self.log_std_columns.as_ref().map_or(self.shape.outputs(), |c| c.start);
         let outputs = outputs.narrow(1, 0, head_len)?;
-        let (means, end_state) = match &self.dmp {
-            None => (outputs, None),
-            Some(dmp) => dmp.segment(&outputs.contiguous()?, needed(&states.starts, "starts")?)?,
+        let Some(dmp) = &self.dmp else {
+            let (means, end_state, squashed_outputs) = (outputs, None, None);
+            return Ok(Means { means, end_state, squashed_outputs, raw_log_stds });
         };
-        Ok(Means { means, end_state, raw_log_stds })
+        let outputs = outputs.contiguous()?;
+        let (means, end_state) = dmp.segment(&outputs, needed(&states.starts, "starts")?)?;
+        let squashed_outputs = Some(dmp.squashed(&outputs)?);
+        Ok(Means { means, end_state, squashed_outputs, raw_log_stds })
     }
 }
 
@@ -129,6 +135,15 @@ impl DmpGraph {
             controller: config.policy.controller,
             carries_state: policy.carries_dmp_state(),
         })
+    }
+
+    /// Returns those of the network's outputs, (B, A (1+N+4)), that get a tanh: (B, A, .).
+    fn squashed(&self, outputs: &Tensor) -> Result<Tensor> {
+        let cells = outputs.reshape((outputs.dim(0)?, self.dims, outputs.dim(1)? / self.dims))?;
+        match self.rho {
+            RhoKind::Bounded => Ok(cells),
+            RhoKind::Free => cells.narrow(2, 0, 1 + self.basis_count),
+        }
     }
 
     /// Computes means and end state from the network's outputs, (B, A (1+N+4)); without the
@@ -179,6 +194,20 @@ impl Means {
         match &self.end_state {
             Some(end) => Tensor::cat(&[u, end], 1),
             None => Ok(u.clone()),
+        }
+    }
+
+    /// Returns the penalty on saturation: the sum of max(|x| - 2, 0)² over all numbers before a
+    /// tanh, as a mean over the batch.
+    pub(super) fn saturation(&self) -> Result<Tensor> {
+        let excess = |x: &Tensor| -> Result<Tensor> {
+            let excess = (x.abs()? - f64::from(UNSATURATED_MAX))?.relu()?;
+            excess.sqr()?.flatten_from(1)?.sum(1)?.mean_all()
+        };
+        let sum = excess(&self.means)?;
+        match &self.squashed_outputs {
+            Some(outputs) => sum + excess(outputs)?,
+            None => Ok(sum),
         }
     }
 

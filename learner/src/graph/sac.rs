@@ -43,7 +43,7 @@ impl Graph {
     }
 
     /// Does an actor step on temperature log pi(u|s) - `value`(s, u), u ~ pi(s), plus the penalties
-    /// on changes of the means, and a step of the temperature towards the target entropy. Returns
+    /// on the means, and a step of the temperature towards the target entropy. Returns
     /// the losses of the whole update.
     pub(super) fn soft_actor_step(
         &mut self,
@@ -56,7 +56,7 @@ impl Graph {
         let (u, density) = means.draw(needed(&batch.noise, "noise")?)?;
         let inputs = self.critic_inputs(&batch.states, &means.with_end_state(&u)?)?;
         let soft = (density.broadcast_mul(&temperature)? - value(self, &inputs)?)?.mean_all()?;
-        let loss = (soft + self.action_penalties(&means.means.tanh()?, batch, &q_size)?)?;
+        let loss = (soft + self.penalties(&means, batch, &q_size)?)?;
         self.descend("actor", &loss, false)?;
 
         let entropy = density.detach().mean_all()?.neg()?;

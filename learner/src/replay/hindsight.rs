@@ -8,6 +8,7 @@
 //!    goal. A window that is short only because the episode's own goal ended it keeps that goal,
 //!    because a missing action is not a zero action.
 //! 4. Goals in the region of the task are preferred ([`super::region`]).
+//! 5. Some goals are the desired goals of other episodes (`replay.other_goals_share`).
 
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::goal_rule::GoalRule;
@@ -30,20 +31,15 @@ pub struct GoalSampler {
     strategy: Hindsight,
     /// Share of the windows that get another goal.
     share: f64,
+    /// Share of these whose goal is the desired one of another episode.
+    other_share: f64,
     motion: Option<Motion>,
     region: Region,
     recent: Recent,
 }
 
-/// An observation row of the replay, whose achieved goal a window gets.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct GoalRow {
-    slot: u32,
-    row: usize,
-}
-
 /// A goal in place of a window's own.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Goal<'a> {
     /// The environment's rule.
     pub rule: &'a GoalRule,
@@ -67,16 +63,18 @@ impl GoalSampler {
         let replay = &config.replay;
         let sampler = Self::new(rule, replay.hindsight, replay.hindsight_share)?;
         let bonus = config.algorithm.motion_bonus;
-        Some(Self { motion: Motion::new(&sampler.rule, replay.moved_share, bonus), ..sampler })
+        let motion = Motion::new(&sampler.rule, replay.moved_share, bonus);
+        Some(Self { motion, other_share: replay.other_goals_share, ..sampler })
     }
 
-    /// Makes a sampler of goals only, without regard to motion, or returns `None` without
-    /// hindsight.
+    /// Makes a sampler of goals that a window's own episode reached, without regard to motion, or
+    /// returns `None` without hindsight.
     #[must_use]
     pub fn new(rule: Option<&GoalRule>, strategy: Hindsight, share: f64) -> Option<Self> {
         let rule = rule.filter(|_| strategy != Hindsight::None)?;
         let (region, recent) = (Region::default(), Recent::default());
-        Some(Self { rule: rule.clone(), strategy, share, motion: None, region, recent })
+        let rule = rule.clone();
+        Some(Self { rule, strategy, share, other_share: 0.0, motion: None, region, recent })
     }
 
     /// Finds the task's region and counts motion in the recent episodes, if that is due. Call it
@@ -134,15 +132,31 @@ impl GoalSampler {
     /// window keeps its own.
     ///
     /// Steps of the episode that have not arrived, or have been replaced, are not drawn.
-    pub fn draw(
-        &self,
-        replay: &Replay,
+    pub fn draw<'a>(
+        &'a self,
+        replay: &'a Replay,
         window: &Window,
         random: &mut Xoshiro256PlusPlus,
-    ) -> Option<GoalRow> {
+    ) -> Option<Goal<'a>> {
         if !random.random_bool(self.share) || replay.slots[window.slot as usize].hindsight {
             return None;
         }
+        let rule = &self.rule;
+        if self.other_share > 0.0 && random.random_bool(self.other_share) {
+            let other = random.random_range(0..replay.filled) as u32;
+            return Some(Goal { rule, values: rule.desired(replay.observation_row(other, 0)) });
+        }
+        let values = self.draw_reached(replay, window, random)?;
+        Some(Goal { rule, values })
+    }
+
+    /// Draws a goal that the window's episode reached.
+    fn draw_reached<'a>(
+        &self,
+        replay: &'a Replay,
+        window: &Window,
+        random: &mut Xoshiro256PlusPlus,
+    ) -> Option<&'a [f32]> {
         let steps_max = replay.layout.segment_steps;
         let live = replay.live(window.slot);
         // Steps of the episode, counted from the oldest live segment. All segments but the last
@@ -162,8 +176,9 @@ impl GoalSampler {
             let rank = live.first_rank + ((step - 1) / steps_max) as u32;
             let slot = replay.slot_at(live.newest, rank)?;
             let row = (step - 1) % steps_max + 1;
-            drawn = Some(GoalRow { slot, row });
-            if self.region.contains(self.rule.achieved(replay.observation_row(slot, row))) {
+            let reached = self.rule.achieved(replay.observation_row(slot, row));
+            drawn = Some(reached);
+            if self.region.contains(reached) {
                 break;
             }
         }
@@ -172,12 +187,6 @@ impl GoalSampler {
 }
 
 impl Replay {
-    /// Returns the goal that was achieved in a row.
-    #[must_use]
-    pub fn achieved_goal<'a>(&'a self, rule: &'a GoalRule, row: GoalRow) -> Goal<'a> {
-        Goal { rule, values: rule.achieved(self.observation_row(row.slot, row.row)) }
-    }
-
     /// Returns the outcome of a window with another goal, or `None` if the window cannot have it.
     #[must_use]
     pub fn outcome(&self, window: &Window, goal: Goal<'_>) -> Option<Outcome> {
@@ -220,6 +229,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use dmprl_shared::config::Windows;
+    use dmprl_shared::seeds;
     use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
     use super::super::Sampler;
@@ -265,10 +275,9 @@ mod tests {
     /// Returns the goals that are drawn for the window at step `offset` of `slot`.
     fn drawn(replay: &Replay, goals: &GoalSampler, slot: usize, offset: usize) -> Vec<f32> {
         let window = replay.window(slot, offset).unwrap();
-        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
-        let rows = (0..400).filter_map(|_| goals.draw(replay, &window, &mut random));
-        let set: BTreeSet<u32> =
-            rows.map(|row| replay.achieved_goal(&goals.rule, row).values[0] as u32).collect();
+        let mut random = seeds::stream(1, "test", 0);
+        let drawn = (0..400).filter_map(|_| goals.draw(replay, &window, &mut random));
+        let set: BTreeSet<u32> = drawn.map(|goal| goal.values[0] as u32).collect();
         set.into_iter().map(|goal| goal as f32).collect()
     }
 
@@ -314,10 +323,10 @@ mod tests {
         goals.region = Region::new(&goals.rule, &replay, &[0, 1, 2]);
         let mut counts = [0; 10];
         let window = replay.window(0, 0).unwrap();
-        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut random = seeds::stream(1, "test", 0);
         for _ in 0..20_000 {
-            let row = goals.draw(&replay, &window, &mut random).unwrap();
-            counts[replay.achieved_goal(&goals.rule, row).values[0] as usize - 86] += 1;
+            let goal = goals.draw(&replay, &window, &mut random).unwrap();
+            counts[goal.values[0] as usize - 86] += 1;
         }
         // Four of nine goals are in the region; eight draws miss it with (5/9)^8 = 0.009.
         assert!(counts[1..=4].iter().all(|&count| count > 4_500), "{counts:?}");
@@ -326,12 +335,26 @@ mod tests {
     }
 
     #[test]
+    fn a_share_of_the_goals_are_desired_goals_of_other_episodes() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 10.0, 6, TRUNCATED);
+        let mut goals = sampler(Hindsight::Final, 1.0, None);
+        goals.other_share = 0.3;
+        assert_eq!(drawn(&replay, &goals, 0, 1), [16.0, GOAL]);
+        let (window, mut random) = (replay.window(0, 1).unwrap(), seeds::stream(1, "test", 0));
+        let draws = (0..10_000).map(|_| goals.draw(&replay, &window, &mut random).unwrap());
+        let count = draws.filter(|goal| goal.values == [GOAL]).count();
+        // Binomial(10000, 0.3) has standard deviation 46; five of them are allowed.
+        assert!(count.abs_diff(3_000) < 230, "{count}");
+    }
+
+    #[test]
     fn share_and_copies_of_workers_are_respected() {
         let mut replay = Replay::new(LAYOUT, 300, 1, 1);
         episode(&mut replay, 10.0, 6, TRUNCATED);
         let window = replay.window(0, 1).unwrap();
         let goals = sampler(Hindsight::Future, 0.8, None);
-        let mut random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut random = seeds::stream(1, "test", 0);
         let count =
             (0..10_000).filter(|_| goals.draw(&replay, &window, &mut random).is_some()).count();
         // Binomial(10000, 0.8) has standard deviation 40; five of them are allowed.
@@ -392,11 +415,12 @@ mod tests {
         read.read(&mut bytes.as_slice()).unwrap();
         let goals = sampler(Hindsight::Future, 0.8, None);
         let draws = |replay: &Replay| {
-            let random = dmprl_shared::seeds::stream(1, "test", 0);
+            let random = seeds::stream(1, "test", 0);
             let mut sampler = Sampler::new(Windows::Sliding, random);
             let draw = |_| {
                 let window = sampler.draw(replay).unwrap();
-                (window, goals.draw(replay, &window, sampler.random_mut()))
+                let goal = goals.draw(replay, &window, sampler.random_mut());
+                (window, goal.map(|goal| goal.values.to_vec()))
             };
             (0..200).map(draw).collect::<Vec<_>>()
         };

@@ -20,7 +20,7 @@ use dmprl_shared::segment::{HINDSIGHT, SegmentHeader, SegmentLayout, TERMINATED,
 use block_store::BlockStore;
 use episodes::{Episodes, Place};
 pub use file::ReplayFileError;
-pub use hindsight::{Goal, GoalRow, GoalSampler, Outcome};
+pub use hindsight::{Goal, GoalSampler, Outcome};
 pub use window::{Sampler, Window};
 
 /// Marks the end of a chain of slots.

@@ -72,6 +72,11 @@ pub struct AlgorithmConfig {
     /// The same for the action acceleration: the penalty is the sum of
     /// (u_{t+1} - 2 u_t + u_{t-1})². Actions before the first one are read from the replay.
     pub action_acceleration_penalty: f64,
+    /// Weight of a penalty on saturation in the actor's loss (not with `ndp`), relative to the
+    /// batch's mean |Q|. The penalty is the sum of max(|x| - 2, 0)² over all numbers x of a
+    /// decision that get a tanh: the outputs for goal, weights and rho, and the actions before
+    /// their tanh. Where a tanh is flat, an actor no longer learns.
+    pub saturation_penalty: f64,
     /// Reward of a step that moves the achieved goal and leaves it in the region of desired goals
     /// and starts, in units of the reward of reaching a goal. It is added while less than half of
     /// the recent episodes move it, if goals are drawn when a batch is sampled and the reward is
@@ -181,6 +186,7 @@ impl Default for AlgorithmConfig {
             critic_layer_norm: false,
             action_rate_penalty: 0.2,
             action_acceleration_penalty: 0.0,
+            saturation_penalty: 0.0,
             motion_bonus: 0.0,
             outcome_model: false,
             td3: Td3Config::default(),

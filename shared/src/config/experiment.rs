@@ -132,6 +132,9 @@ pub struct ReplayConfig {
     /// Share of a batch's windows that get another goal, if goals are drawn when a batch is
     /// sampled.
     pub hindsight_share: f64,
+    /// Share of these windows that get the desired goal of another episode, instead of a goal that
+    /// their own episode reached. Such goals show a policy where it does not succeed.
+    pub other_goals_share: f64,
     /// Share of a batch's windows that come from episodes in which the achieved goal moved and
     /// stayed in the region of desired goals and starts, if goals are drawn when a batch is sampled
     /// and the reward is sparse. Where few episodes did, the share may be smaller. While a
@@ -148,6 +151,7 @@ impl Default for ReplayConfig {
             capacity_steps: 1_000_000,
             hindsight: Hindsight::None,
             hindsight_share: 0.8,
+            other_goals_share: 0.0,
             moved_share: 0.0,
             hindsight_copies: 4,
         }

@@ -115,6 +115,7 @@ critic_hidden = [256, 256]
 critic_layer_norm = false
 action_rate_penalty = 0.0
 action_acceleration_penalty = 0.0
+saturation_penalty = 0.0
 motion_bonus = 0.0
 outcome_model = false
 [algorithm.td3]
@@ -137,6 +138,7 @@ warm_up_range = 1.0
 capacity_steps = 1000000
 hindsight = "none"
 hindsight_share = 0.8
+other_goals_share = 0.0
 moved_share = 0.0
 hindsight_copies = 4
 [pacing]

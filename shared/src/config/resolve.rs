@@ -212,6 +212,7 @@ impl ExperimentConfig {
         let random = self.exploration.random_segments;
         let shares = [
             ("replay.hindsight_share", self.replay.hindsight_share),
+            ("replay.other_goals_share", self.replay.other_goals_share),
             ("replay.moved_share", self.replay.moved_share),
             ("exploration.random_segments", random),
             ("exploration.settled_share", self.exploration.settled_share),
@@ -365,7 +366,9 @@ mod tests {
             ("algorithm.polyak", "nan"),
             ("algorithm.action_rate_penalty", "-0.1"),
             ("algorithm.action_acceleration_penalty", "inf"),
+            ("algorithm.saturation_penalty", "-1"),
             ("replay.hindsight_share", "1.1"),
+            ("replay.other_goals_share", "1.1"),
             ("replay.moved_share", "-0.1"),
             ("algorithm.motion_bonus", "-1"),
             ("exploration.random_segments", "-0.1"),

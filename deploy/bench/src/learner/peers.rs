@@ -126,8 +126,12 @@ fn unsupported(config: &ExperimentConfig) -> Option<&'static str> {
             "tests/peers has no policy.controller = \"direct\"",
         ),
         (
-            algorithm.action_rate_penalty + algorithm.action_acceleration_penalty > 0.0,
-            "tests/peers has neither algorithm.action_rate_penalty nor action_acceleration_penalty",
+            algorithm.action_rate_penalty
+                + algorithm.action_acceleration_penalty
+                + algorithm.saturation_penalty
+                > 0.0,
+            "tests/peers has no algorithm.action_rate_penalty, action_acceleration_penalty or \
+             saturation_penalty",
         ),
     ];
     differences.into_iter().find_map(|(differs, why)| differs.then_some(why))
@@ -187,6 +191,7 @@ mod tests {
             ("policy.rho", "free"),
             ("algorithm.action_rate_penalty", "0.2"),
             ("algorithm.action_acceleration_penalty", "0.2"),
+            ("algorithm.saturation_penalty", "0.2"),
             ("policy.start", "action"),
             ("policy.controller", "direct"),
         ] {

@@ -93,13 +93,14 @@ pub(super) fn run(args: &LearnerArgs) -> anyhow::Result<Outcome> {
         )));
     };
     let threads = args.threads.map(|threads| Value::Integer(threads.into()));
-    // The peers do not implement our penalties on changes of actions.
+    // The peers do not implement our penalties.
     let no_price = (!args.peer.is_empty()).then_some(Value::Float(0.0));
     let flags = [
         flag("--device", "learner.device", args.device.clone().map(Value::String)),
         flag("--threads", "learner.threads", threads),
         flag("--peer", "algorithm.action_rate_penalty", no_price.clone()),
-        flag("--peer", "algorithm.action_acceleration_penalty", no_price),
+        flag("--peer", "algorithm.action_acceleration_penalty", no_price.clone()),
+        flag("--peer", "algorithm.saturation_penalty", no_price),
     ];
     let sources = args.configured.sources(&args.task, flags)?;
     let config = merge(&sources)?.resolve(Limits { cores: cores() }).map_err(refuse)?;

@@ -4,6 +4,8 @@
 //! g = goal_range t, w = weight_range omega² t, and rho = (1, 0, 0, 0) + rho_range t. With
 //! `rho = "free"`, rho = (1, 0, 0, 0) + output. Other controllers than `inverse` have no rho.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 use super::start::StartState;
@@ -106,6 +108,13 @@ impl DmpHead {
     #[must_use]
     pub fn outputs_len(&self) -> usize {
         self.dims * self.per_dimension()
+    }
+
+    /// Ranges of the outputs that get a tanh. Outputs for an unbounded rho do not.
+    pub fn squashed_outputs(&self) -> impl Iterator<Item = Range<usize>> {
+        let n = self.per_dimension();
+        let len = if self.rho == RhoKind::Bounded { n } else { 1 + self.basis_count };
+        (0..self.dims).map(move |d| d * n..d * n + len)
     }
 
     fn per_dimension(&self) -> usize {
