@@ -21,6 +21,8 @@ mod exploration;
 #[cfg(feature = "python")]
 mod faults;
 #[cfg(feature = "python")]
+mod goal_switching;
+#[cfg(feature = "python")]
 mod hindsight;
 #[cfg(feature = "python")]
 pub mod policy_health;

@@ -15,6 +15,7 @@ use thiserror::Error;
 
 use crate::exploration::Exploration;
 use crate::faults::{FailureBudgetExceeded, Faults};
+use crate::goal_switching::GoalSwitching;
 use crate::hindsight::{EpisodeSegment, Hindsight};
 use crate::policy_runner::PolicyRunner;
 use crate::python_env::{PythonEnvironments, PythonError, SUCCESS_NOT_REPORTED, SUCCESS_YES};
@@ -106,6 +107,7 @@ pub struct Rollout {
     environments: PythonEnvironments,
     runner: PolicyRunner,
     exploration: Exploration,
+    goal_switching: Option<GoalSwitching>,
     episodes: Vec<Episode>,
     faults: Faults,
     hindsight: Option<Hindsight>,
@@ -142,7 +144,10 @@ impl Rollout {
         environments.reset(&all, &env_seeds)?;
         faults.inspect_reset(&mut environments, &all)?;
         let hindsight = Hindsight::start(config, &environments, layout, worker)?;
+        let rule = environments.spec().goal_rule.as_deref();
+        let goals = seeds::stream(config.run.seed, "goals", worker);
         Ok(Self {
+            goal_switching: GoalSwitching::new(rule, config, goals),
             hindsight,
             identity,
             warm_up_steps: config.exploration.warm_up_steps,
@@ -188,6 +193,9 @@ impl Rollout {
             if self.loaded_version != self.snapshot.version {
                 self.runner.take_policy(&self.snapshot.values);
                 self.loaded_version = self.snapshot.version;
+            }
+            if let Some(goals) = &mut self.goal_switching {
+                goals.pursue(&mut self.runner.observations);
             }
             self.runner.run_network();
             self.exploration.explore(&mut self.runner, self.snapshot.settled);
@@ -266,6 +274,9 @@ impl Rollout {
         }
         self.runner.next_state(env, true);
         self.exploration.episode_ended(env);
+        if let Some(goals) = &mut self.goal_switching {
+            goals.episode_ended(env);
+        }
         self.episodes[env] = Episode { number: self.episodes[env].number + 1, steps: 0 };
     }
 

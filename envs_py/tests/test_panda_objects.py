@@ -235,7 +235,7 @@ class ScriptedTest(unittest.TestCase):
             np.testing.assert_array_equal(
                 steps["next_observations"][:-1][inner], steps["observations"][1:][inner]
             )
-            self.assertLessEqual(np.abs(steps["actions"]).max(), 0.6)
+            self.assertLessEqual(np.abs(steps["actions"]).max(), CONTROLLERS[task_id].action_max)
             kept = recording.successful()
             self.assertEqual(len(kept["rewards"]), length * recording.success.sum())
             self.assertTrue((kept["rewards"][length - 1 :: length] == 0.0).all())

@@ -25,6 +25,8 @@ STEP_S = 0.04
 """Duration of a step [s]."""
 ACTION_MAX = 0.6
 """Largest action, because policies of these tasks use this share of the action range."""
+SLOW_ACTION_MAX = 0.4
+"""The same for `panda-push` and `panda-pick-and-place`."""
 TRAVEL_HEIGHT = 0.09
 """Height of the end effector at which it passes over an object."""
 PUSH_HEIGHT = 0.02
@@ -67,6 +69,9 @@ class State(NamedTuple):
 class Controller(ABC):
     """Acts in one episode, with displacements of the end effector."""
 
+    action_max = ACTION_MAX
+    """Larger actions are clipped."""
+
     @abstractmethod
     def act(self, state: State) -> NDArray[np.float64]:
         """Chooses the action (A,) for a state."""
@@ -74,6 +79,8 @@ class Controller(ABC):
 
 class Push(Controller):
     """Pushes the cube to the goal."""
+
+    action_max = SLOW_ACTION_MAX
 
     def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
         return push(state, 0, state.goals[0])
@@ -150,6 +157,8 @@ class Slide(Controller):
 
 class PickAndPlace(Controller):
     """Grips the cube from above, brings it to the goal and holds it there."""
+
+    action_max = SLOW_ACTION_MAX
 
     def act(self, state: State) -> NDArray[np.float64]:  # noqa: D102 - inherited
         return carry(state, 0, state.goals[0])
@@ -342,8 +351,8 @@ def record(task_id: str, episodes: int, seed: int) -> Recording:
     kept: dict[str, list[NDArray]] = {}
     while not out.truncated.any():
         for index, controller in enumerate(controllers):
-            state = split(task, out.next_observations[index])
-            out.actions[index, 0] = controller.act(state)
+            state, most = split(task, out.next_observations[index]), controller.action_max
+            out.actions[index, 0] = np.clip(controller.act(state), -most, most)
         env.step_segment(out.actions, out)
         step = {
             "observations": out.observations[:, 0],

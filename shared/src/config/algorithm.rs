@@ -294,6 +294,11 @@ pub struct ExplorationConfig {
     /// move the achieved goal (as for `algorithm.motion_bonus`). Random actions find an object, and
     /// are in the way of placing it.
     pub settled_share: f64,
+    /// Probability, for each decision at which the goal is reached, that a worker's policy gets
+    /// another goal to pursue: the desired one of an earlier episode. Environment, replay and
+    /// statistics keep the episode's own goal. It needs a sparse goal rule, and `replay.hindsight`,
+    /// which gives the replay's windows goals of their own.
+    pub goal_switches: f64,
     /// Length of the warm-up, in which actions are random: environment steps of all workers
     /// together.
     pub warm_up_steps: u64,
@@ -310,6 +315,7 @@ impl Default for ExplorationConfig {
             std: 0.1,
             random_segments: 0.0,
             settled_share: 1.0,
+            goal_switches: 0.0,
             warm_up_steps: 3_000,
             warm_up_kind: WarmUpKind::Uniform,
             warm_up_range: 0.3,

@@ -55,7 +55,9 @@ interval_steps = 1000
 const GOAL: &str = r#"
 [algorithm]
 discount = 0.98
+batch_size = 128
 action_rate_penalty = 0.0
+saturation_penalty = 0.003
 motion_bonus = 1.0
 outcome_model = true
 [algorithm.td3]
@@ -65,10 +67,12 @@ kind = "segment"
 std = 0.2
 random_segments = 0.3
 settled_share = 0.4
+goal_switches = 0.5
 warm_up_kind = "segment"
 warm_up_range = 1.0
 [replay]
 hindsight = "future"
+other_goals_share = 0.15
 moved_share = 0.5
 [pacing]
 updates_per_segment = 5.0
@@ -131,6 +135,7 @@ kind = "gaussian"
 std = 0.1
 random_segments = 0.0
 settled_share = 1.0
+goal_switches = 0.0
 warm_up_steps = 10000
 warm_up_kind = "uniform"
 warm_up_range = 1.0
@@ -242,6 +247,7 @@ action_rate_penalty = 0.0
 [exploration]
 random_segments = 0.0
 settled_share = 1.0
+goal_switches = 0.0
 warm_up_steps = 0
 [replay]
 hindsight = "none"

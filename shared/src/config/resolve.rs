@@ -216,6 +216,7 @@ impl ExperimentConfig {
             ("replay.moved_share", self.replay.moved_share),
             ("exploration.random_segments", random),
             ("exploration.settled_share", self.exploration.settled_share),
+            ("exploration.goal_switches", self.exploration.goal_switches),
             ("algorithm.td3.target_smaller_weight", self.algorithm.td3.target_smaller_weight),
         ];
         for (key, got) in shares {
@@ -373,6 +374,7 @@ mod tests {
             ("algorithm.motion_bonus", "-1"),
             ("exploration.random_segments", "-0.1"),
             ("exploration.settled_share", "1.1"),
+            ("exploration.goal_switches", "1.1"),
             ("algorithm.td3.target_smaller_weight", "1.1"),
             ("algorithm.tqc.critics", "11"),
             ("algorithm.tqc.dropped_quantiles", "25"),
