@@ -329,17 +329,23 @@ impl Graph {
         let u = means.means.tanh()?;
         let inputs = self.critic_inputs(&batch.states, &means.with_end_state(&u)?)?;
         let q = self.forward(critic, Of::Frozen, &inputs)?.mean_all()?;
-        let loss = (self.penalties(&means, batch, q_size)? - q)?;
+        let loss = (self.penalties(&means, &u, batch, q_size)? - q)?;
         self.descend("actor", &loss, true)?;
         Ok(loss)
     }
 
     /// Returns the penalties on a policy's decisions: on the rate and the acceleration of its
-    /// actions, and on saturation. They are sums of squares, as means over the batch and shares of
-    /// |Q|.
-    fn penalties(&self, means: &Means, batch: &DeviceBatch, q_size: &Tensor) -> Result<Tensor> {
+    /// noise-free actions u, (B, K A), and on saturation. They are sums of squares, as means over
+    /// the batch and shares of |Q|.
+    fn penalties(
+        &self,
+        means: &Means,
+        u: &Tensor,
+        batch: &DeviceBatch,
+        q_size: &Tensor,
+    ) -> Result<Tensor> {
         let weight = self.config.algorithm.saturation_penalty;
-        let changes = self.action_penalties(&means.means.tanh()?, batch, q_size)?;
+        let changes = self.action_penalties(u, batch, q_size)?;
         if weight == 0.0 {
             return Ok(changes);
         }

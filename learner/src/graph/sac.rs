@@ -43,8 +43,8 @@ impl Graph {
     }
 
     /// Does an actor step on temperature log pi(u|s) - `value`(s, u), u ~ pi(s), plus the penalties
-    /// on the means, and a step of the temperature towards the target entropy. Returns
-    /// the losses of the whole update.
+    /// on the means, and a step of the temperature towards the target entropy. Returns the losses
+    /// of the whole update.
     pub(super) fn soft_actor_step(
         &mut self,
         batch: &DeviceBatch,
@@ -56,7 +56,8 @@ impl Graph {
         let (u, density) = means.draw(needed(&batch.noise, "noise")?)?;
         let inputs = self.critic_inputs(&batch.states, &means.with_end_state(&u)?)?;
         let soft = (density.broadcast_mul(&temperature)? - value(self, &inputs)?)?.mean_all()?;
-        let loss = (soft + self.penalties(&means, batch, &q_size)?)?;
+        let mean_u = means.means.tanh()?;
+        let loss = (soft + self.penalties(&means, &mean_u, batch, &q_size)?)?;
         self.descend("actor", &loss, false)?;
 
         let entropy = density.detach().mean_all()?.neg()?;
