@@ -1,4 +1,4 @@
-"""A peer of ``dmprl bench peers``: trains an agent of Stable-Baselines3 or SBX until a target.
+"""A peer of ``dmprl bench peers``: trains another library's agent until a target.
 
 ``python agent_peer.py sb3-td3|… --settings FILE --package FOLDER`` writes one JSON object a line.
 The first is ``{"ready": "description"}``, or ``{"absent": "why"}`` if it cannot. One follows each
@@ -30,7 +30,22 @@ AGENTS = {
     "sbx-td3": ("sbx", "TD3"),
     "sbx-sac": ("sbx", "SAC"),
     "sbx-crossq": ("sbx", "CrossQ"),
+    "sb3-tqc-her": ("sb3_contrib", "TQC"),
 }
+WITH_HINDSIGHT = "sb3-tqc-her"
+
+ZOO_SETTINGS = {
+    "batch_size": 2048,
+    "buffer_size": 1_000_000,
+    "gamma": 0.95,
+    "learning_rate": 1e-3,
+    "tau": 0.05,
+    "policy_kwargs": {"net_arch": [512, 512, 512], "n_critics": 2},
+}
+"""Settings of the RL Zoo for TQC on the tasks of Fetch and the Panda that move an object."""
+
+GOALS_PER_STEP = 4
+"""Achieved goals that hindsight draws for each step, among those of later steps, as in the Zoo."""
 
 
 class Evaluator:
@@ -80,7 +95,8 @@ def make(kind, settings):
         "options": settings["options"],
         "spec": {"episode_steps": 0},
     }
-    env, evaluated = (flattened(bench_peers.gymnasium_env(plan)) for _ in range(2))
+    shaped = with_time if kind == WITH_HINDSIGHT else flattened
+    env, evaluated = (shaped(bench_peers.gymnasium_env(plan)) for _ in range(2))
     arguments = {"learning_starts": settings["learning_starts"], "seed": settings["seed"]}
     arguments["device"] = "cpu"  # as ours
     if name == "TD3":
@@ -88,9 +104,12 @@ def make(kind, settings):
 
         size = env.action_space.shape
         arguments["action_noise"] = NormalActionNoise(np.zeros(size), np.full(size, NOISE))
+    if kind == WITH_HINDSIGHT:
+        arguments |= ZOO_SETTINGS | hindsight()
     if settings["algorithm"] is not None:
         arguments |= ours(name, settings["algorithm"])
-    agent = getattr(agents, name)("MlpPolicy", env, **arguments)
+    policy = "MultiInputPolicy" if kind == WITH_HINDSIGHT else "MlpPolicy"
+    agent = getattr(agents, name)(policy, env, **arguments)
     return agent, evaluated, f"{module} {agents.__version__}"
 
 
@@ -109,6 +128,21 @@ def ours(name, algorithm):
     if name != "CrossQ":  # which has no target networks
         arguments["tau"] = algorithm["polyak"]
     return arguments
+
+
+def hindsight():
+    """Returns the arguments for replaying steps with goals that were achieved later."""
+    from stable_baselines3 import HerReplayBuffer
+
+    goals = {"goal_selection_strategy": "future", "n_sampled_goal": GOALS_PER_STEP}
+    return {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": goals}
+
+
+def with_time(env):
+    """Returns an environment that also observes the rest of the episode, as in the Zoo."""
+    from sb3_contrib.common.wrappers import TimeFeatureWrapper
+
+    return TimeFeatureWrapper(env)
 
 
 def flattened(env):

@@ -156,14 +156,14 @@ impl Figures {
             ),
             String::new(),
             format!(
-                "  {:<11}{:>8}  {:>8}  {:<17}{:>9}{:>8}{:>8}{:>8}",
+                "  {:<12}{:>8}  {:>8}  {:<17}{:>9}{:>8}{:>8}{:>8}",
                 "", "reached", "time s", "(range)", "steps", "start", "eval", "ratio"
             ),
         ];
         for candidate in &self.candidates {
             lines.push(match &candidate.note {
                 Some(why) if candidate.trainings.is_empty() => {
-                    format!("  {:<11}absent: {why}", candidate.name())
+                    format!("  {:<12}absent: {why}", candidate.name())
                 }
                 _ => self.row(candidate),
             });
@@ -190,7 +190,7 @@ impl Figures {
         let seconds = candidate.values(|it| it.seconds);
         let middle = |value: fn(&Training) -> f64| median(&candidate.values(value)).unwrap_or(0.0);
         format!(
-            "  {:<11}{:>8}  {time:>8}  {:<17}{:>9}{:>8.1}{:>8.1}{ratio:>8}",
+            "  {:<12}{:>8}  {time:>8}  {:<17}{:>9}{:>8.1}{:>8.1}{ratio:>8}",
             candidate.name(),
             format!("{}/{count}", candidate.reached()),
             format!("({:.1} to {:.1})", min(&seconds), max(&seconds)),

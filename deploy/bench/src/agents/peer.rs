@@ -27,6 +27,9 @@ pub enum AgentKind {
     SbxSac,
     /// CrossQ of SBX (JAX).
     SbxCrossq,
+    /// TQC with hindsight of SB3-Contrib (PyTorch), for tasks with goals; the RL Zoo's settings for
+    /// those that move an object.
+    Sb3TqcHer,
 }
 
 impl AgentKind {
@@ -38,6 +41,7 @@ impl AgentKind {
             Self::SbxTd3 => "sbx-td3",
             Self::SbxSac => "sbx-sac",
             Self::SbxCrossq => "sbx-crossq",
+            Self::Sb3TqcHer => "sb3-tqc-her",
         }
     }
 }

@@ -18,8 +18,8 @@ const HELP: &str = "\
 Trains one seed after another with each candidate, in turns, until an evaluation reaches the target.
 The time runs from the start of the process, imports included. Ours is a whole `dmprl train`, up to
 its end. A peer has one environment, the CPU, and its library's default settings (TD3: with Gaussian
-noise of 0.1), or ours with --equal-settings. All have the same number of steps before the first
-update, and the same interval, episodes and seeds of evaluations.
+noise of 0.1; sb3-tqc-her: the RL Zoo's), or ours with --equal-settings. All have the same number of
+steps before the first update, and the same interval, episodes and seeds of evaluations.
 Without --peer-python, the peers' packages are installed into .venv-peers on first use.
 Ctrl-C stops the benchmark and removes its processes and trainings.
 
@@ -28,7 +28,8 @@ EXAMPLES
   dmprl bench peers --task panda-reach-joints --until-success 0.99 --preset fast --seeds 3
   dmprl bench peers --task HalfCheetah-v5 --policy mlp --until-return 3000 --steps 200000 \\
       --max-minutes 60 --peer sb3-td3 --peer sbx-crossq --json
-  dmprl bench peers --task pusher --until-return -34 --preset fast --equal-settings";
+  dmprl bench peers --task pusher --until-return -34 --preset fast --equal-settings
+  dmprl bench peers --task panda-push --until-success 0.95 --peer sb3-tqc-her --seeds 1";
 
 /// Arguments of `dmprl bench peers`.
 #[derive(Debug, Args)]
@@ -64,7 +65,7 @@ pub(super) struct PeersArgs {
     /// per step instead of their libraries' defaults.
     #[arg(long)]
     equal_settings: bool,
-    /// Python interpreter with stable-baselines3 and sbx-rl [default: that of .venv-peers].
+    /// Python interpreter with the peers' libraries [default: that of .venv-peers].
     #[arg(long, value_name = "PATH")]
     peer_python: Option<PathBuf>,
     /// Print one JSON object on standard output.
