@@ -41,7 +41,7 @@ GRIP_HEIGHT = 0.07
 """Height of the end effector over an object before it descends to grip it."""
 OPEN_WIDTH, GRIPPED_WIDTH = 0.06, (0.036, 0.058)
 """Width of the fingers above which they fit around a cube, and range in which they hold it."""
-CARRY_GAIN, CARRY_MAX = 0.3, 0.025
+CARRY_GAIN, CARRY_MAX = 0.4, 0.025
 """Share of the way to the goal in one step, and its maximum along each axis. A faster start would
 pull the fingers off the cube."""
 OPEN, CLOSE = ACTION_MAX, -ACTION_MAX
@@ -170,11 +170,11 @@ class Stack(Controller):
     An upper cube that is in the way is first brought aside.
     """
 
-    settle_steps = 6
+    settle_steps = 4
     """Steps until the upper cube has fallen to the table at the start."""
     spots = np.array([[x, y, 0.02] for x in (-0.12, 0.0, 0.12) for y in (-0.12, 0.0, 0.12)])
     """Places for a cube that is in the way (N, 3)."""
-    clearance = 0.09
+    clearance = 0.07
     """Distance of two cubes along some axis at which both can be gripped and put down."""
 
     def __init__(self) -> None:
@@ -305,7 +305,7 @@ def is_held(state: State, index: int) -> bool:
 def is_put(state: State, index: int, goal: NDArray[np.float64]) -> bool:
     """Returns whether a cube is at a goal, precisely enough to release it, or to leave it."""
     offset = state.objects[index] - goal
-    precision = 0.015 if is_held(state, index) else 0.03
+    precision = 0.015 if is_held(state, index) else 0.045
     return bool(np.linalg.norm(offset[:2]) < precision and abs(offset[2]) < 0.015)
 
 
