@@ -51,10 +51,12 @@ interval_steps = 1000
 "#;
 
 // Without random segments FetchPush stays at chance: noise around a policy that does not touch the
-// object does not move it (docs/decisions/0091-preset-goal.md).
+// object does not move it (docs/decisions/0091-preset-goal.md). With a larger rate most of the
+// actor's units become inactive (docs/decisions/0122-units-that-stay-active.md).
 const GOAL: &str = r#"
 [algorithm]
 discount = 0.98
+actor_learning_rate = 0.0003
 batch_size = 128
 action_rate_penalty = 0.0
 saturation_penalty = 0.003

@@ -440,11 +440,10 @@ warm_up_steps = 2000
 threads = 1
 "#;
 
-// docs/decisions/0107-discount-with-goals.md and 0122-units-that-stay-active.md
+// docs/decisions/0107-discount-with-goals.md
 const PANDA_GOAL: &str = r#"
 [algorithm]
 discount = 0.95
-actor_learning_rate = 0.0003
 "#;
 
 impl TaskDefaults {
