@@ -140,8 +140,11 @@ def hindsight():
 
 def with_time(env):
     """Returns an environment that also observes the rest of the episode, as in the Zoo."""
+    import gymnasium
     from sb3_contrib.common.wrappers import TimeFeatureWrapper
 
+    if not isinstance(env.observation_space, gymnasium.spaces.Dict):
+        raise ValueError("hindsight needs an environment with goals, as a Dict observation")
     return TimeFeatureWrapper(env)
 
 

@@ -51,7 +51,7 @@ interval_steps = 1000
 "#;
 
 // Without random segments FetchPush stays at chance: noise around a policy that does not touch the
-// object does not move it (docs/decisions/0091-preset-goal.md). With a larger rate most of the
+// object does not move it (docs/decisions/0091-preset-goal.md). With a larger rate many of the
 // actor's units become inactive (docs/decisions/0122-units-that-stay-active.md).
 const GOAL: &str = r#"
 [algorithm]
