@@ -127,7 +127,8 @@ impl Learner {
                 env_count: envs as u32,
             },
             replay: Replay::new(layout, replay_steps, workers, envs),
-            sampler: Sampler::new(config.algorithm.windows, random),
+            sampler: Sampler::new(config.algorithm.windows, random)
+                .with_demonstrated(config.demonstrations.share),
             normaliser: config.policy.normalise_observations.then(|| {
                 // The first update follows the warm-up; then each doubling of the observations.
                 let relative = hindsight.as_ref().map(|goals| RelativeGoal::new(&goals.rule));

@@ -22,9 +22,10 @@ impl<'a> Sample<'a> {
         hindsight: Option<&'a GoalSampler>,
         sampler: &mut Sampler,
     ) -> Option<Self> {
-        let window = match hindsight {
-            Some(hindsight) => hindsight.draw_window(replay, sampler)?,
-            None => sampler.draw(replay)?,
+        let window = match (sampler.draw_shared(replay), hindsight) {
+            (Some(demonstrated), _) => demonstrated,
+            (None, Some(hindsight)) => hindsight.draw_window(replay, sampler)?,
+            (None, None) => sampler.draw(replay)?,
         };
         let drawn = hindsight.and_then(|hindsight| {
             let goal = hindsight.draw(replay, &window, sampler.random_mut())?;

@@ -28,7 +28,7 @@ use thiserror::Error;
 use crate::finite::NotFiniteParameter;
 use crate::learner::{Counters, Learner};
 use crate::normaliser::Normaliser;
-use crate::replay::{Replay, ReplayFileError, Sampler};
+use crate::replay::{Replay, ReplayFileError};
 use crate::update::adam::StepCount;
 
 pub use background::{WriteOutcome, Writer};
@@ -369,8 +369,7 @@ fn load(folder: &Path, learner: &mut Learner) -> Result<(), CheckpointError> {
     learner.counters = state.counters;
     learner.inbox.restore(&state.settled);
     learner.regime.restore_updates_owed(state.updates_owed);
-    let windows = learner.config().algorithm.windows;
-    learner.sampler = Sampler::new(windows, state.sampler_random);
+    learner.sampler.restore(state.sampler_random);
     Ok(())
 }
 

@@ -12,6 +12,7 @@ mod hindsight;
 mod motion;
 mod recent;
 mod region;
+mod sampler;
 mod unreached;
 mod window;
 
@@ -21,7 +22,8 @@ use block_store::BlockStore;
 use episodes::{Episodes, Place};
 pub use file::ReplayFileError;
 pub use hindsight::{Goal, GoalSampler, Outcome};
-pub use window::{Sampler, Window};
+pub use sampler::Sampler;
+pub use window::Window;
 
 /// Marks the end of a chain of slots.
 const NONE: u32 = u32::MAX;

@@ -169,11 +169,14 @@ pub struct DemonstrationsConfig {
     /// Environment steps after the warm-up over which the imitation term of the actor's updates
     /// falls linearly to zero.
     pub imitation_steps: u64,
+    /// Share of the sampled windows that come from the demonstrations, in addition to those that
+    /// are drawn from all of the replay.
+    pub share: f64,
 }
 
 impl Default for DemonstrationsConfig {
     fn default() -> Self {
-        Self { files: Vec::new(), cloning_updates: 1_000, imitation_steps: 30_000 }
+        Self { files: Vec::new(), cloning_updates: 1_000, imitation_steps: 30_000, share: 0.1 }
     }
 }
 
