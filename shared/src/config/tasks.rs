@@ -340,8 +340,8 @@ updates_per_segment = 4.0
 
 // Observation: achieved goal (3), desired goal (3), position of the end effector (3), its velocity
 // (3), position, rotation, velocity and angular velocity of the cube (3 each).
-const PANDA_PUSH_VALUES: &[&str] = &[PANDA_HAND, PANDA_OBJECTS, PANDA_SLOW];
-const PANDA_SLIDE_VALUES: &[&str] = &[PANDA_HAND, PANDA_OBJECTS, PANDA_FAST];
+const PANDA_PUSH_VALUES: &[&str] = &[PANDA_HAND, PANDA_OBJECTS, PUSH_RANGE];
+const PANDA_SLIDE_VALUES: &[&str] = &[PANDA_HAND, PANDA_OBJECTS, STRIKE_RANGE];
 const PANDA_HAND: &str = r#"
 [task]
 start_sources = [
@@ -363,7 +363,7 @@ start_sources = [
 ]
 "#,
     PANDA_OBJECTS,
-    PANDA_SLOW,
+    PUSH_RANGE,
 ];
 
 // As above, with goals of two cubes (6 each).
@@ -378,7 +378,7 @@ start_sources = [
 ]
 "#,
     PANDA_OBJECTS,
-    PANDA_FAST,
+    STACK_RANGE,
 ];
 
 const PANDA_OBJECTS: &str = r#"
@@ -386,23 +386,18 @@ const PANDA_OBJECTS: &str = r#"
 steps = 200000
 [algorithm]
 discount = 0.98
+[policy]
+position_scale = 20.0
 "#;
 
 // An action of 1 moves the end effector by 0.05 m, as in PANDA_REACH_VALUES. At that speed the arm
-// strikes a cube more than it pushes it (docs/decisions/0104-action-range.md). `--algo ndp`, for
-// which `position_scale` is, uses all of the range.
-const PANDA_SLOW: &str = r#"
-[policy]
-action_range = 0.4
-position_scale = 20.0
-"#;
-
-// With slower actions a puck does not reach every goal, and stacking takes too long.
-const PANDA_FAST: &str = r#"
-[policy]
-action_range = 0.6
-position_scale = 20.0
-"#;
+// strikes a cube more than it pushes it, and sends a puck too far
+// (docs/decisions/0104-action-range.md). With slower actions stacking takes too long. `--algo ndp`,
+// for which `position_scale` is, uses all of the range. These lines continue the last table of
+// PANDA_OBJECTS.
+const PUSH_RANGE: &str = "action_range = 0.4\n";
+const STRIKE_RANGE: &str = "action_range = 0.25\n";
+const STACK_RANGE: &str = "action_range = 0.6\n";
 
 // Table 2 of the paper, column of the Panda tasks.
 const PANDA_PAPER: &str = r#"
