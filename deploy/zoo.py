@@ -7,7 +7,6 @@ without changes. The copy names no path of this machine.
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -17,8 +16,6 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 ZOO = ROOT / "envs_py" / "dmprl" / "zoo"
 EPISODES = 100
-PATH = re.compile('"/[^"]*/')
-"""A quotation mark and the folder after it."""
 
 
 def add(run: Path, name: str | None) -> Path:
@@ -29,9 +26,7 @@ def add(run: Path, name: str | None) -> Path:
             sys.exit(f"{run}: trained by a build with uncommitted changes: {session['git_commit']}")
         session["command"] = ["dmprl", *without_paths(session["command"][1:])]
     config = (run / "config.toml").read_text()
-    # Only `resume` would need the demonstrations, and it needs a checkpoint.
-    config = re.sub(r"^files = .*", lambda line: PATH.sub('"', line[0]), config, flags=re.MULTILINE)
-    # Paths of modules and secrets are on one line of their own each.
+    # Paths of demonstrations, modules and secrets are on one line of their own each.
     if '"/' in config or manifest["init_from"]:
         sys.exit(f"{run}: its config.toml or manifest names a file of this machine")
     row = evaluated(run)

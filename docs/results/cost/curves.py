@@ -87,9 +87,7 @@ def line(
 ) -> str:
     """Returns a polyline."""
     joined = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    style = f'stroke="{colour}" stroke-width="2"' + (
-        f' stroke-dasharray="{dashes}"' if dashes else ""
-    )
+    style = f'stroke="{colour}" stroke-width="{thickness}" stroke-dasharray="{dashes}"'
     return f'<polyline points="{joined}" fill="none" {style}/>'
 
 

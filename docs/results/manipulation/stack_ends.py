@@ -11,10 +11,10 @@ from __future__ import annotations
 import sys
 
 import numpy as np
+from goal_distances import distance, ends
 
 import dmprl
 
-FIRST_SEED = 6000
 THRESHOLD = 0.1
 """Largest distance of both cubes together [m] at which the goal is reached."""
 HALF_EDGE = 0.02
@@ -26,29 +26,16 @@ HEADER = "env_steps,episodes,success_rate,share_raised,share_above,share_release
 
 def measure(run: dmprl.Run, episodes: int) -> str:
     """Runs the episodes and returns the line."""
-    policy, env = run.policy("latest"), dmprl.make("panda-stack")
-    ends = []
-    for seed in range(FIRST_SEED, FIRST_SEED + episodes):
-        observation, _ = env.reset(seed=seed)
-        policy.reset()
-        ended = False
-        while not ended:
-            row = np.concatenate([observation[key] for key in sorted(observation)])
-            for action in policy.segment(row):
-                observation, _, terminated, truncated, _ = env.step(action)
-                ended = terminated or truncated
-                if ended:
-                    break
-        lower, upper = observation["achieved_goal"].reshape(2, 3)
-        missed = observation["achieved_goal"] - observation["desired_goal"]
+    counted = []
+    for end in ends(run, "panda-stack", episodes):
+        lower, upper = end["achieved_goal"].reshape(2, 3)
         is_above = upper[2] > lower[2] + HALF_EDGE
         is_above &= np.abs(upper[:2] - lower[:2]).max() < 2 * HALF_EDGE
-        width = observation["observation"][6]
-        is_reached = np.linalg.norm(missed) < THRESHOLD
         is_raised = upper[2] > 2 * HALF_EDGE
-        ends.append((is_reached, is_raised, is_above, is_above and width > RELEASED))
-    shares = [f"{share:.3f}" for share in np.mean(ends, axis=0)]
-    return ",".join([str(policy.file.env_steps), str(episodes), *shares])
+        is_released = is_above and end["observation"][6] > RELEASED
+        counted.append((distance(end) < THRESHOLD, is_raised, is_above, is_released))
+    shares = [f"{share:.3f}" for share in np.mean(counted, axis=0)]
+    return ",".join([str(run.policy("latest").file.env_steps), str(episodes), *shares])
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ impl<'a> Sample<'a> {
         hindsight: Option<&'a GoalSampler>,
         sampler: &mut Sampler,
     ) -> Option<Self> {
-        let window = match (sampler.draw_shared(replay), hindsight) {
+        let window = match (sampler.draw_due_demonstration(replay), hindsight) {
             (Some(demonstrated), _) => demonstrated,
             (None, Some(hindsight)) => hindsight.draw_window(replay, sampler)?,
             (None, None) => sampler.draw(replay)?,
@@ -47,4 +47,33 @@ pub(super) fn target_range(hindsight: Option<&GoalSampler>, config: &AlgorithmCo
         .filter(|_| is_return)
         .and_then(|hindsight| hindsight.return_range(config.discount))
         .unwrap_or([f32::NEG_INFINITY, f32::INFINITY])
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::config::{Hindsight, Windows};
+    use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED};
+
+    use super::*;
+    use crate::learner::tests::goal_rule;
+
+    #[test]
+    fn samples_with_and_without_hindsight_take_the_share_of_the_demonstrations() {
+        let layout = SegmentLayout { segment_steps: 1, observation_len: 2, action_len: 1 };
+        let mut replay = Replay::new(layout, 100, 1, 1);
+        let header = SegmentHeader { steps_len: 1, flags: TERMINATED, ..Default::default() };
+        replay.insert_demonstration(&header, &[7.0, 0.0, 7.0, 0.0, 0.1, -1.0]);
+        (0..20).for_each(|_| replay.insert(&header, &[1.0, 0.0, 1.0, 0.0, 0.1, -1.0]));
+        let goals = GoalSampler::new(Some(&goal_rule()), Hindsight::Final, 1.0);
+        for hindsight in [None, goals.as_ref()] {
+            let demonstrated = |share| {
+                let random = dmprl_shared::seeds::stream(1, "test", 0);
+                let mut sampler = Sampler::new(Windows::Segment, random).with_demonstrated(share);
+                let mut draw = || Sample::draw(&replay, hindsight, &mut sampler).unwrap().window;
+                (0..50).filter(|_| replay.observation(&draw())[0] == 7.0).count()
+            };
+            assert_eq!(demonstrated(1.0), 50);
+            assert!(demonstrated(0.0) < 25);
+        }
+    }
 }

@@ -294,3 +294,13 @@ fn an_actor_follows_its_critic_after_the_warm_up_and_then_more_and_more() {
     assert_eq!(warm_up, 0.0);
     assert!(0.0 < early && early < late && late < over, "{early} {late} {over}");
 }
+
+#[test]
+fn the_configured_share_reaches_the_sampler() {
+    for (share, expected) in [("0", false), ("1", true)] {
+        let mut learner = learner(&[("demonstrations.share", share)]);
+        learner.demonstrate(&[steps()]).unwrap();
+        let drawn = learner.sampler.draw_due_demonstration(&learner.replay);
+        assert_eq!(drawn.is_some(), expected, "{share}");
+    }
+}

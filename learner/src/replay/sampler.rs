@@ -13,7 +13,7 @@ const TRIES_MAX: usize = 100_000;
 #[derive(Debug, Clone)]
 pub struct Sampler {
     windows: Windows,
-    /// Share of the windows of [`Sampler::draw_shared`] that come from the demonstrations.
+    /// Probability with which [`Sampler::draw_due_demonstration`] draws a window.
     demonstrated: f64,
     random: Xoshiro256PlusPlus,
 }
@@ -63,7 +63,7 @@ impl Sampler {
 
     /// Draws one window from the demonstrations with the configured probability. Returns `None`
     /// otherwise, and without demonstrations.
-    pub fn draw_shared(&mut self, replay: &Replay) -> Option<Window> {
+    pub fn draw_due_demonstration(&mut self, replay: &Replay) -> Option<Window> {
         let is_due = replay.demonstrations > 0 && self.flip(self.demonstrated);
         is_due.then(|| self.draw_demonstration(replay)).flatten()
     }
@@ -120,12 +120,13 @@ mod tests {
         let random = || dmprl_shared::seeds::stream(1, "test", 0);
         let mut replay = Replay::new(LAYOUT, 300, 1, 1);
         let mut sampler = Sampler::new(Windows::Segment, random()).with_demonstrated(0.25);
-        assert!(sampler.draw_shared(&replay).is_none(), "no demonstrations");
+        assert!(sampler.draw_due_demonstration(&replay).is_none(), "no demonstrations");
         assert!(sampler.random() == &random(), "a run without demonstrations draws as before");
         let header = SegmentHeader { steps_len: 3, flags: TERMINATED, ..SegmentHeader::default() };
         replay.insert_demonstration(&header, &vec![0.0; LAYOUT.block_len()]);
         episode(&mut replay, 0, 6, TERMINATED);
-        let drawn: Vec<_> = (0..4_000).filter_map(|_| sampler.draw_shared(&replay)).collect();
+        let drawn: Vec<_> =
+            (0..4_000).filter_map(|_| sampler.draw_due_demonstration(&replay)).collect();
         assert!(drawn.iter().all(|window| window.slot == 0));
         // Binomial(4000, 1/4) has standard deviation 27; five of them are allowed.
         assert!(drawn.len().abs_diff(1_000) < 137, "{}", drawn.len());
