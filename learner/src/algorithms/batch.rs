@@ -8,9 +8,8 @@ use rand_distr::StandardNormal;
 use thiserror::Error;
 
 use super::outcome_shape::OutcomeShape;
-use super::sample::{Sample, target_range};
-use crate::normaliser::Normaliser;
-use crate::replay::{Goal, GoalSampler, Replay, Sampler};
+use super::sample::{Sample, SampleSource, target_range};
+use crate::replay::{Goal, Replay};
 
 /// The replay has no window to learn from.
 #[derive(Debug, Error)]
@@ -116,6 +115,8 @@ pub struct Batch {
     /// Smallest and largest target that the rewards allow; infinite if unknown.
     pub target_range: [f32; 2],
     actions: Vec<f32>,
+    /// The goal of a row, where no observation has it.
+    goal: Vec<f32>,
 }
 
 /// The same states in the units of the DMP and as network inputs, (B, O) each.
@@ -125,27 +126,6 @@ pub struct States<'a> {
     pub observations: &'a [f32],
     /// As network inputs, normalised if configured.
     pub inputs: &'a [f32],
-}
-
-/// The source of a batch's samples.
-#[derive(Debug)]
-pub struct SampleSource<'a> {
-    /// The experience.
-    pub replay: &'a Replay,
-    /// Draws the windows.
-    pub sampler: &'a mut Sampler,
-    /// Draws other goals for windows, if configured.
-    pub hindsight: Option<&'a GoalSampler>,
-    /// Normalises network inputs, if configured.
-    pub normaliser: Option<&'a Normaliser>,
-}
-
-impl SampleSource<'_> {
-    /// Borrows the source again, for one of several samples.
-    pub fn reborrow(&mut self) -> SampleSource<'_> {
-        let Self { replay, sampler, hindsight, normaliser } = self;
-        SampleSource { replay, sampler, hindsight: *hindsight, normaliser: *normaliser }
-    }
 }
 
 impl Batch {
@@ -181,6 +161,7 @@ impl Batch {
             motion: vec![0.0; shape.rows * shape.outcome.map_or(0, OutcomeShape::outputs)],
             target_range: [f32::NEG_INFINITY, f32::INFINITY],
             actions: vec![0.0; shape.segment_actions_len],
+            goal: Vec::new(),
         }
     }
 
@@ -202,8 +183,9 @@ impl Batch {
     ) -> Result<(), NoWindow> {
         let SampleSource { replay, sampler, hindsight, normaliser } = source;
         let (replay, hindsight, normaliser) = (*replay, *hindsight, *normaliser);
+        let mut goal = std::mem::take(&mut self.goal);
         for row in 0..shape.rows {
-            let sample = Sample::draw(replay, hindsight, sampler)
+            let sample = Sample::draw(replay, hindsight, sampler, &mut goal)
                 .ok_or(NoWindow { segments: replay.len(), steps: replay.layout().segment_steps })?;
             self.write_states(shape, row, replay, &sample, config);
             let (o, width) = (shape.observation_len, shape.critic_inputs());
@@ -224,6 +206,7 @@ impl Batch {
                 end[dims..].iter_mut().for_each(|velocity| *velocity /= omega);
             }
         }
+        self.goal = goal;
         match normaliser {
             Some(normaliser) => normaliser.apply(&self.next_observations, &mut self.next_inputs),
             None => self.next_inputs.copy_from_slice(&self.next_observations),
@@ -311,6 +294,8 @@ mod tests {
     use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
     use super::*;
+    use crate::normaliser::Normaliser;
+    use crate::replay::Sampler;
 
     const LAYOUT: SegmentLayout =
         SegmentLayout { segment_steps: 2, observation_len: 1, action_len: 1 };

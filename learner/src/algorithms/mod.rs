@@ -25,7 +25,7 @@ use dmprl_shared::goal_rule::GoalRule;
 use dmprl_shared::policy::{MlpShape, Policy, initial_parameters};
 use dmprl_shared::seeds;
 
-pub use batch::{Batch, BatchShape, NoWindow, SampleSource};
+pub use batch::{Batch, BatchShape, NoWindow};
 pub use losses::Losses;
 
 use crate::graph::{self, Graph, NamedNetworks};
@@ -34,6 +34,7 @@ use crate::update::thread_pool::ThreadPool;
 use ddpg::Ddpg;
 pub(crate) use outcome::new_outcome_model;
 use sac::Sac;
+pub use sample::SampleSource;
 use td3::Td3;
 
 /// An algorithm that learns from batches of a replay, with its networks and threads.

@@ -2,7 +2,29 @@
 
 use dmprl_shared::config::{AlgorithmConfig, Target};
 
+use crate::normaliser::Normaliser;
 use crate::replay::{Goal, GoalSampler, Outcome, Replay, Sampler, Window};
+
+/// The source of a batch's samples.
+#[derive(Debug)]
+pub struct SampleSource<'a> {
+    /// The experience.
+    pub replay: &'a Replay,
+    /// Draws the windows.
+    pub sampler: &'a mut Sampler,
+    /// Draws other goals for windows, if configured.
+    pub hindsight: Option<&'a GoalSampler>,
+    /// Normalises network inputs, if configured.
+    pub normaliser: Option<&'a Normaliser>,
+}
+
+impl SampleSource<'_> {
+    /// Borrows the source again, for one of several samples.
+    pub fn reborrow(&mut self) -> SampleSource<'_> {
+        let Self { replay, sampler, hindsight, normaliser } = self;
+        SampleSource { replay, sampler, hindsight: *hindsight, normaliser: *normaliser }
+    }
+}
 
 /// A window with the goal and the outcome that the batch takes.
 pub(super) struct Sample<'a> {
@@ -16,11 +38,12 @@ pub(super) struct Sample<'a> {
 
 impl<'a> Sample<'a> {
     /// Draws a window, and a goal for it, if hindsight is configured. Returns `None` if the replay
-    /// has no window.
+    /// has no window. `buffer` keeps a goal that nothing in the replay has.
     pub(super) fn draw(
         replay: &'a Replay,
         hindsight: Option<&'a GoalSampler>,
         sampler: &mut Sampler,
+        buffer: &'a mut Vec<f32>,
     ) -> Option<Self> {
         let window = match (sampler.draw_due_demonstration(replay), hindsight) {
             (Some(demonstrated), _) => demonstrated,
@@ -28,7 +51,7 @@ impl<'a> Sample<'a> {
             (None, None) => sampler.draw(replay)?,
         };
         let drawn = hindsight.and_then(|hindsight| {
-            let goal = hindsight.draw(replay, &window, sampler.random_mut())?;
+            let goal = hindsight.draw(replay, &window, sampler.random_mut(), buffer)?;
             let outcome = replay.outcome(&window, goal)?;
             Some(Self { window, outcome, goal: Some(goal), hindsight: Some(hindsight) })
         });
@@ -69,7 +92,9 @@ mod tests {
             let demonstrated = |share| {
                 let random = dmprl_shared::seeds::stream(1, "test", 0);
                 let mut sampler = Sampler::new(Windows::Segment, random).with_demonstrated(share);
-                let mut draw = || Sample::draw(&replay, hindsight, &mut sampler).unwrap().window;
+                let mut draw = || {
+                    Sample::draw(&replay, hindsight, &mut sampler, &mut Vec::new()).unwrap().window
+                };
                 (0..50).filter(|_| replay.observation(&draw())[0] == 7.0).count()
             };
             assert_eq!(demonstrated(1.0), 50);

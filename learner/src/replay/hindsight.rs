@@ -9,6 +9,7 @@
 //!    because a missing action is not a zero action.
 //! 4. Goals in the region of the task are preferred ([`super::region`]).
 //! 5. Some goals are the desired goals of other episodes (`replay.other_goals_share`).
+//! 6. Some reached goals are moved, so that the window misses them (`replay.near_misses_share`).
 
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::goal_rule::GoalRule;
@@ -33,6 +34,8 @@ pub struct GoalSampler {
     share: f64,
     /// Share of these whose goal is the desired one of another episode.
     other_share: f64,
+    /// Share of the reached goals that are moved.
+    near_share: f64,
     motion: Option<Motion>,
     region: Region,
     recent: Recent,
@@ -64,7 +67,8 @@ impl GoalSampler {
         let sampler = Self::new(rule, replay.hindsight, replay.hindsight_share)?;
         let bonus = config.algorithm.motion_bonus;
         let motion = Motion::new(&sampler.rule, replay.moved_share, bonus);
-        Some(Self { motion, other_share: replay.other_goals_share, ..sampler })
+        let (other_share, near_share) = (replay.other_goals_share, replay.near_misses_share);
+        Some(Self { motion, other_share, near_share, ..sampler })
     }
 
     /// Makes a sampler of goals that a window's own episode reached, without regard to motion, or
@@ -73,8 +77,9 @@ impl GoalSampler {
     pub fn new(rule: Option<&GoalRule>, strategy: Hindsight, share: f64) -> Option<Self> {
         let rule = rule.filter(|_| strategy != Hindsight::None)?;
         let (region, recent) = (Region::default(), Recent::default());
-        let rule = rule.clone();
-        Some(Self { rule, strategy, share, other_share: 0.0, motion: None, region, recent })
+        let (rule, motion) = (rule.clone(), None);
+        let (other_share, near_share) = (0.0, 0.0);
+        Some(Self { rule, strategy, share, other_share, near_share, motion, region, recent })
     }
 
     /// Finds the task's region and counts motion in the recent episodes, if that is due. Call it
@@ -131,12 +136,14 @@ impl GoalSampler {
     /// Draws a goal for a window, in the region if one of some draws is. Returns `None` if the
     /// window keeps its own.
     ///
-    /// Steps of the episode that have not arrived, or have been replaced, are not drawn.
+    /// Steps of the episode that have not arrived, or have been replaced, are not drawn. `buffer`
+    /// keeps a goal that nothing in the replay has.
     pub fn draw<'a>(
         &'a self,
         replay: &'a Replay,
         window: &Window,
         random: &mut Xoshiro256PlusPlus,
+        buffer: &'a mut Vec<f32>,
     ) -> Option<Goal<'a>> {
         if !random.random_bool(self.share) || replay.slots[window.slot as usize].hindsight {
             return None;
@@ -146,8 +153,31 @@ impl GoalSampler {
             let other = random.random_range(0..replay.filled) as u32;
             return Some(Goal { rule, values: rule.desired(replay.observation_row(other, 0)) });
         }
-        let values = self.draw_reached(replay, window, random)?;
-        Some(Goal { rule, values })
+        let reached = self.draw_reached(replay, window, random)?;
+        if self.near_share == 0.0 || !random.random_bool(self.near_share) {
+            return Some(Goal { rule, values: reached });
+        }
+        self.write_near_miss(replay, reached, random, buffer);
+        Some(Goal { rule, values: buffer })
+    }
+
+    /// Writes a reached goal, moved by a random part of the way by which another episode of the
+    /// replay has missed its goal so far.
+    fn write_near_miss(
+        &self,
+        replay: &Replay,
+        reached: &[f32],
+        random: &mut Xoshiro256PlusPlus,
+        out: &mut Vec<f32>,
+    ) {
+        let other = random.random_range(0..replay.filled) as u32;
+        let last = replay.last_row(replay.live(other).newest);
+        let part = random.random::<f32>();
+        let way = self.rule.desired(last).iter().zip(self.rule.achieved(last));
+        let moved =
+            reached.iter().zip(way).map(|(reached, (to, from))| reached + part * (to - from));
+        out.clear();
+        out.extend(moved);
     }
 
     /// Draws a goal that the window's episode reached.
@@ -272,12 +302,22 @@ mod tests {
         }
     }
 
+    /// Draws a goal for a window.
+    fn draw(
+        replay: &Replay,
+        goals: &GoalSampler,
+        window: &Window,
+        random: &mut Xoshiro256PlusPlus,
+    ) -> Option<f32> {
+        goals.draw(replay, window, random, &mut Vec::new()).map(|goal| goal.values[0])
+    }
+
     /// Returns the goals that are drawn for the window at step `offset` of `slot`.
     fn drawn(replay: &Replay, goals: &GoalSampler, slot: usize, offset: usize) -> Vec<f32> {
         let window = replay.window(slot, offset).unwrap();
         let mut random = seeds::stream(1, "test", 0);
-        let drawn = (0..400).filter_map(|_| goals.draw(replay, &window, &mut random));
-        let set: BTreeSet<u32> = drawn.map(|goal| goal.values[0] as u32).collect();
+        let drawn = (0..400).filter_map(|_| draw(replay, goals, &window, &mut random));
+        let set: BTreeSet<u32> = drawn.map(|goal| goal as u32).collect();
         set.into_iter().map(|goal| goal as f32).collect()
     }
 
@@ -325,8 +365,8 @@ mod tests {
         let window = replay.window(0, 0).unwrap();
         let mut random = seeds::stream(1, "test", 0);
         for _ in 0..20_000 {
-            let goal = goals.draw(&replay, &window, &mut random).unwrap();
-            counts[goal.values[0] as usize - 86] += 1;
+            let goal = draw(&replay, &goals, &window, &mut random).unwrap();
+            counts[goal as usize - 86] += 1;
         }
         // Four of nine goals are in the region; eight draws miss it with (5/9)^8 = 0.009.
         assert!(counts[1..=4].iter().all(|&count| count > 4_500), "{counts:?}");
@@ -342,10 +382,29 @@ mod tests {
         goals.other_share = 0.3;
         assert_eq!(drawn(&replay, &goals, 0, 1), [16.0, GOAL]);
         let (window, mut random) = (replay.window(0, 1).unwrap(), seeds::stream(1, "test", 0));
-        let draws = (0..10_000).map(|_| goals.draw(&replay, &window, &mut random).unwrap());
-        let count = draws.filter(|goal| goal.values == [GOAL]).count();
+        let draws = (0..10_000).map(|_| draw(&replay, &goals, &window, &mut random).unwrap());
+        let count = draws.filter(|&goal| goal == GOAL).count();
         // Binomial(10000, 0.3) has standard deviation 46; five of them are allowed.
         assert!(count.abs_diff(3_000) < 230, "{count}");
+    }
+
+    #[test]
+    fn a_share_of_the_reached_goals_is_moved_as_far_as_other_episodes_missed_theirs() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 10.0, 6, TRUNCATED); // misses its goal by 74
+        episode(&mut replay, 70.0, 6, 0); // by 14 so far
+        let mut goals = sampler(Hindsight::Final, 1.0, None);
+        goals.near_share = 0.4;
+        let (window, mut random) = (replay.window(0, 1).unwrap(), seeds::stream(1, "test", 0));
+        let draws = (0..10_000).map(|_| draw(&replay, &goals, &window, &mut random).unwrap());
+        let moved: Vec<f32> = draws.map(|goal| goal - 16.0).filter(|&way| way != 0.0).collect();
+        // Binomials: (10000, 0.4) has standard deviation 49; half of the 4000 moves, and 14/74 of
+        // the other half, are at most 14 long, with 31. Five standard deviations are allowed.
+        assert!(moved.len().abs_diff(4_000) < 245, "{}", moved.len());
+        assert!(moved.iter().all(|way| (0.0..=74.0).contains(way)));
+        let short = moved.iter().filter(|&&way| way <= 14.0).count();
+        let expected = (0.5 + 0.5 * 14.0 / 74.0) * moved.len() as f64;
+        assert!((short as f64 - expected).abs() < 160.0, "{short} {expected}");
     }
 
     #[test]
@@ -356,7 +415,7 @@ mod tests {
         let goals = sampler(Hindsight::Future, 0.8, None);
         let mut random = seeds::stream(1, "test", 0);
         let count =
-            (0..10_000).filter(|_| goals.draw(&replay, &window, &mut random).is_some()).count();
+            (0..10_000).filter(|_| draw(&replay, &goals, &window, &mut random).is_some()).count();
         // Binomial(10000, 0.8) has standard deviation 40; five of them are allowed.
         assert!(count.abs_diff(8_000) < 200, "{count}");
         let header = SegmentHeader { flags: HINDSIGHT, steps_len: 3, ..Default::default() };
@@ -419,8 +478,8 @@ mod tests {
             let mut sampler = Sampler::new(Windows::Sliding, random);
             let draw = |_| {
                 let window = sampler.draw(replay).unwrap();
-                let goal = goals.draw(replay, &window, sampler.random_mut());
-                (window, goal.map(|goal| goal.values.to_vec()))
+                let goal = draw(replay, &goals, &window, sampler.random_mut());
+                (window, goal)
             };
             (0..200).map(draw).collect::<Vec<_>>()
         };

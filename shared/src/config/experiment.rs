@@ -122,19 +122,20 @@ pub enum Hindsight {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplayConfig {
-    /// Capacity in environment steps, including hindsight copies. A full replay overwrites its
-    /// oldest steps.
+    /// Capacity in environment steps, with hindsight copies. When full, the oldest are overwritten.
     pub capacity_steps: usize,
     /// Goals of hindsight experience replay. Needs a goal-conditioned environment. If its rewards
     /// follow a rule, goals are drawn anew whenever a batch is sampled; otherwise workers make
     /// copies of their segments.
     pub hindsight: Hindsight,
-    /// Share of a batch's windows that get another goal, if goals are drawn when a batch is
-    /// sampled.
+    /// Share of a batch's windows that get another goal, if it is drawn when a batch is sampled.
     pub hindsight_share: f64,
     /// Share of these windows that get the desired goal of another episode, instead of a goal that
     /// their own episode reached. Such goals show a policy where it does not succeed.
     pub other_goals_share: f64,
+    /// Share of the reached goals that are moved by a random part of the way by which another
+    /// episode of the replay missed its goal. Such goals show the critics where success ends.
+    pub near_misses_share: f64,
     /// Share of a batch's windows that come from episodes in which the achieved goal moved and
     /// stayed in the region of desired goals and starts, if goals are drawn when a batch is sampled
     /// and the reward is sparse. Where few episodes did, the share may be smaller. While a
@@ -152,6 +153,7 @@ impl Default for ReplayConfig {
             hindsight: Hindsight::None,
             hindsight_share: 0.8,
             other_goals_share: 0.0,
+            near_misses_share: 0.0,
             moved_share: 0.0,
             hindsight_copies: 4,
         }

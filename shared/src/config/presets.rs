@@ -75,6 +75,7 @@ warm_up_range = 1.0
 [replay]
 hindsight = "future"
 other_goals_share = 0.15
+near_misses_share = 0.4
 moved_share = 0.5
 [pacing]
 updates_per_segment = 5.0
@@ -146,6 +147,7 @@ capacity_steps = 1000000
 hindsight = "none"
 hindsight_share = 0.8
 other_goals_share = 0.0
+near_misses_share = 0.0
 moved_share = 0.0
 hindsight_copies = 4
 [pacing]

@@ -213,6 +213,7 @@ impl ExperimentConfig {
         let shares = [
             ("replay.hindsight_share", self.replay.hindsight_share),
             ("replay.other_goals_share", self.replay.other_goals_share),
+            ("replay.near_misses_share", self.replay.near_misses_share),
             ("replay.moved_share", self.replay.moved_share),
             ("demonstrations.share", self.demonstrations.share),
             ("exploration.random_segments", random),
@@ -371,6 +372,7 @@ mod tests {
             ("algorithm.saturation_penalty", "-1"),
             ("replay.hindsight_share", "1.1"),
             ("replay.other_goals_share", "1.1"),
+            ("replay.near_misses_share", "1.1"),
             ("replay.moved_share", "-0.1"),
             ("algorithm.motion_bonus", "-1"),
             ("exploration.random_segments", "-0.1"),
