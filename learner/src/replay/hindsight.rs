@@ -408,6 +408,15 @@ mod tests {
     }
 
     #[test]
+    fn the_configured_shares_reach_the_sampler() {
+        let mut config = ExperimentConfig::default();
+        config.replay.hindsight = Hindsight::Future;
+        (config.replay.other_goals_share, config.replay.near_misses_share) = (0.1, 0.2);
+        let goals = GoalSampler::from_config(Some(&rule(None)), &config).unwrap();
+        assert_eq!((goals.other_share, goals.near_share), (0.1, 0.2));
+    }
+
+    #[test]
     fn share_and_copies_of_workers_are_respected() {
         let mut replay = Replay::new(LAYOUT, 300, 1, 1);
         episode(&mut replay, 10.0, 6, TRUNCATED);
