@@ -92,6 +92,7 @@ fn allocations_of_a_learner(algorithm: &str, hindsight: &str) -> u64 {
         ("algorithm.action_rate_penalty", penalty),
         ("algorithm.action_acceleration_penalty", penalty),
         ("algorithm.saturation_penalty", penalty),
+        ("algorithm.imitation_penalty", penalty),
         ("algorithm.outcome_model", outcome_model),
         ("replay.hindsight", hindsight),
         ("policy.start", "zero"),

@@ -110,6 +110,8 @@ pub struct Batch {
     /// 1 if u_{t-2}, and u_{t-1}, exist, 0 if the episode began later or the replay no longer has
     /// them, (B, 2). The second is 1 where the first is.
     pub has_previous: Vec<f32>,
+    /// 1 if the window led to its goal, else 0, (B,). Filled only with a penalty on imitation.
+    pub led_to_goal: Vec<f32>,
     /// How each step of the window moves the achieved goal, for the outcome model, (B, K G).
     pub motion: Vec<f32>,
     /// Smallest and largest target that the rewards allow; infinite if unknown.
@@ -135,6 +137,13 @@ impl Batch {
         States { observations: &self.observations, inputs: &self.inputs }
     }
 
+    /// Returns the actions that led to the goal of a row, (K, A), if they did.
+    #[must_use]
+    pub fn imitated(&self, shape: BatchShape, row: usize) -> Option<&[f32]> {
+        let first = row * shape.critic_inputs() + shape.observation_len;
+        (self.led_to_goal[row] > 0.0).then(|| &self.critic_inputs[first..][..shape.actions_len])
+    }
+
     /// Returns the states from which the target bootstraps.
     #[must_use]
     pub fn next_states(&self) -> States<'_> {
@@ -158,6 +167,7 @@ impl Batch {
             noise: noise(shape.noise),
             previous_actions: vec![0.0; shape.rows * 2 * shape.action_len],
             has_previous: vec![0.0; shape.rows * 2],
+            led_to_goal: vec![0.0; shape.rows],
             motion: vec![0.0; shape.rows * shape.outcome.map_or(0, OutcomeShape::outputs)],
             target_range: [f32::NEG_INFINITY, f32::INFINITY],
             actions: vec![0.0; shape.segment_actions_len],
@@ -277,6 +287,9 @@ impl Batch {
         let first = row * shape.critic_inputs() + shape.observation_len;
         self.critic_inputs[first..first + shape.actions_len]
             .copy_from_slice(&self.actions[..shape.actions_len]);
+        if config.imitates() {
+            self.led_to_goal[row] = f32::from(u8::from(sample.led_to_goal(replay)));
+        }
         if config.action_rate_penalty + config.action_acceleration_penalty > 0.0 {
             for (index, previous) in replay.previous_actions(window).into_iter().enumerate() {
                 let at = 2 * row + index;

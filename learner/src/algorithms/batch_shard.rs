@@ -338,10 +338,10 @@ impl BatchShard {
         }
     }
 
-    /// Adds the penalties on changes of tanh(means) to the actor's loss and its gradient. Call it
+    /// Adds the penalties on the actions tanh(means) to the actor's loss and its gradient. Call it
     /// after [`BatchShard::unsquash`]. Sets the actions to tanh(means).
     pub fn penalise(&mut self, policy: &Policy, penalties: ActionPenalties, batch: &Batch) {
-        if penalties.ignore_changes() {
+        if penalties.ignore_actions() {
             return;
         }
         let BatchShape { action_len: dims, segment_actions_len: len, .. } = self.shape;
@@ -354,6 +354,7 @@ impl BatchShard {
                 actions,
                 previous: &batch.previous_actions[2 * at * dims..2 * (at + 1) * dims],
                 has_previous: [batch.has_previous[2 * at], batch.has_previous[2 * at + 1]],
+                imitated: batch.imitated(self.shape, at),
             };
             let slope = |i: usize| (1.0 - actions[i] * actions[i]) / self.batch_rows;
             self.sums.actor += penalties.add(row, gradient, slope);

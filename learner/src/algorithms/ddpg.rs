@@ -23,7 +23,8 @@
 //!    worker.
 //! 10. Tasks have their own defaults (`shared/src/config/tasks.rs`).
 //! 11. The actor's loss has penalties on action changes (`action_rate_penalty` and
-//!     `action_acceleration_penalty`). One on saturation is optional (`saturation_penalty`).
+//!     `action_acceleration_penalty`). Those on saturation and on the distance from actions that
+//!     led to the goal are optional (`saturation_penalty`, `imitation_penalty`).
 //! 12. rho stays within `rho_range` of (1, 0, 0, 0), because the paper does not specify it. This
 //!     also holds for `paper`.
 //! 13. With `outcome_model` the critic also sees predicted outcomes of the segment (`outcome.rs`).

@@ -156,6 +156,37 @@ fn a_window_that_reaches_its_new_goal_early_terminates_and_has_no_later_actions(
 }
 
 #[test]
+fn whole_windows_that_led_to_their_goal_are_imitated() {
+    // The final goal is 3, and both windows move towards it.
+    let imitated = |config: AlgorithmConfig, rule: &GoalRule, flag| {
+        let hindsight = GoalSampler::new(Some(rule), Hindsight::Final, 1.0);
+        let random = dmprl_shared::seeds::stream(1, "test", 0);
+        let mut sampler = Sampler::new(Windows::Sliding, random);
+        let (mut batch, replay) = (Batch::new(SHAPE), replay(flag));
+        let mut source = SampleSource {
+            replay: &replay,
+            sampler: &mut sampler,
+            hindsight: hindsight.as_ref(),
+            normaliser: None,
+        };
+        batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
+        let actions = (0..SHAPE.rows).filter_map(|row| batch.imitated(SHAPE, row));
+        let mut actions: Vec<_> = actions.map(<[f32]>::to_vec).collect();
+        actions.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        actions.dedup();
+        actions
+    };
+    let config = AlgorithmConfig { imitation_penalty: 0.1, ..config() };
+    let both = [[0.1, 0.2], [0.2, 0.3]];
+    assert_eq!(imitated(config.clone(), &rule(None), TRUNCATED), both);
+    assert_eq!(imitated(config.clone(), &rule(Some(0.5)), TERMINATED), both);
+    let wide = GoalReward::Sparse { threshold: 1.5, reached: 0.0, missed: -1.0 };
+    let wide = GoalRule { reward: wide, ..rule(Some(1.5)) };
+    assert_eq!(imitated(config, &wide, TERMINATED), both[..1], "the second one ends early");
+    assert!(imitated(self::config(), &rule(None), TRUNCATED).is_empty(), "no penalty");
+}
+
+#[test]
 fn targets_beyond_the_range_are_those_at_its_end() {
     for name in ["ddpg", "td3"] {
         let keys = [("algorithm.name", name)];

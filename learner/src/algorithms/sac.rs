@@ -16,8 +16,9 @@
 //! 4. Squared errors without the factor one half; PyTorch's initialisation.
 //! 5. A time limit is not a termination: truncated episodes bootstrap.
 //! 6. With policy `dmp` the actor's loss has penalties on changes of its means
-//!    (`action_rate_penalty`, `action_acceleration_penalty`). One on saturation is optional
-//!    (`saturation_penalty`).
+//!    (`action_rate_penalty`, `action_acceleration_penalty`). Those on saturation and on the
+//!    distance from actions that led to the goal are optional (`saturation_penalty`,
+//!    `imitation_penalty`).
 //! 7. Learning rates of networks come from the configuration (1e-3 instead of 3e-4); that of the
 //!    temperature is 3e-4. Two updates per segment are 0.4 per environment step instead of 1.
 //!    Observations are normalised.

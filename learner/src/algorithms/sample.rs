@@ -62,6 +62,18 @@ impl<'a> Sample<'a> {
     }
 }
 
+impl Sample<'_> {
+    /// Returns whether the window led to its goal, with all its steps.
+    pub(super) fn led_to_goal(&self, replay: &Replay) -> bool {
+        let Self { window, outcome, goal, hindsight } = self;
+        let Some(rule) = hindsight.map(|hindsight| &hindsight.rule) else { return false };
+        let own = || rule.desired(replay.observation(window));
+        let values = goal.map_or_else(own, |goal| goal.values);
+        let is_whole = outcome.steps == replay.layout().segment_steps;
+        is_whole && replay.led_to(window, Goal { rule, values })
+    }
+}
+
 /// Returns the range of the targets: that of the returns that a sparse goal rule allows. The soft
 /// values of SAC and TQC and the undiscounted sums of `literal` have no such range.
 pub(super) fn target_range(hindsight: Option<&GoalSampler>, config: &AlgorithmConfig) -> [f32; 2] {

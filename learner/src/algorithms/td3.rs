@@ -11,7 +11,8 @@
 //! 4. Two updates per segment are 0.4 per environment step instead of 1. Observations are
 //!    normalised. Warm-up actions come from a part of the range (`exploration.warm_up_range`).
 //! 5. With policy `dmp` the actor's loss has penalties on action changes (`action_rate_penalty`
-//!    and `action_acceleration_penalty`). One on saturation is optional (`saturation_penalty`).
+//!    and `action_acceleration_penalty`). Those on saturation and on the distance from actions that
+//!    led to the goal are optional (`saturation_penalty`, `imitation_penalty`).
 //! 6. A time limit is not a termination: truncated episodes bootstrap, as in their code.
 //! 7. The larger value of the two target critics may have a weight, too (`target_smaller_weight`),
 //!    as in Fujimoto et al. 2019, "Off-policy deep reinforcement learning without exploration".

@@ -71,6 +71,9 @@ fn case_with(keys: &[(&str, &str)], rule: Option<GoalRule>) -> Case {
     for (row, has) in batch.has_previous.chunks_exact_mut(2).enumerate() {
         has.copy_from_slice([&[0.0, 0.0], &[0.0, 1.0], &[1.0, 1.0]][row % 3]);
     }
+    if config.algorithm.imitates() {
+        batch.led_to_goal.iter_mut().step_by(2).for_each(|led| *led = 1.0);
+    }
     Case { config, rule, policy, algorithm, batch }
 }
 
@@ -155,7 +158,7 @@ fn assert_within(tolerance: f64, name: &str, got: &[f32], expected: &[f32]) {
 
 #[test]
 fn an_update_equals_automatic_differentiation() {
-    let cases: [&[(&str, &str)]; 20] = [
+    let cases: [&[(&str, &str)]; 22] = [
         &[],
         &[("policy.kind", "mlp")],
         &[("policy.kind", "chunk")],
@@ -174,6 +177,8 @@ fn an_update_equals_automatic_differentiation() {
         &[("algorithm.action_rate_penalty", "0.7"), ("policy.start", "carry")],
         &[("algorithm.action_acceleration_penalty", "0.7")],
         &[("algorithm.action_acceleration_penalty", "0.7"), ("policy.kind", "mlp")],
+        &[("algorithm.imitation_penalty", "0.7")],
+        &[("algorithm.imitation_penalty", "0.7"), ("policy.start", "carry")],
         &[("policy.start", "action"), ("policy.controller", "direct")],
         &[("policy.start", "action"), ("algorithm.action_acceleration_penalty", "0.3")],
     ];

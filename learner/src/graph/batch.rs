@@ -24,6 +24,8 @@ pub(super) struct DeviceBatch {
     pub(super) previous_actions: Tensor,
     /// 1 if u_{t-2}, and u_{t-1}, exist, else 0, (B, 2).
     pub(super) has_previous: Tensor,
+    /// 1 if the window led to its goal, else 0, (B, 1).
+    pub(super) led_to_goal: Tensor,
     /// Motion of the achieved goal, (B, K G), for the outcome model.
     pub(super) motion: Option<Tensor>,
     rewards: Tensor,
@@ -62,7 +64,7 @@ pub(super) struct Upload {
 }
 
 /// The tensors of a batch, and the factors of Adam's steps.
-const PARTS: usize = 15;
+const PARTS: usize = 16;
 
 impl Graph {
     /// Copies a batch to the device. It is one copy, because each has a price besides its bytes.
@@ -87,6 +89,7 @@ impl Graph {
             &batch.noise,
             &batch.previous_actions,
             &batch.has_previous,
+            &batch.led_to_goal,
             &batch.motion,
             &batch.rewards,
             &batch.bootstrap,
@@ -120,7 +123,7 @@ impl Graph {
         let [inputs, starts, distances, next_inputs, next_starts, next_distances, views @ ..] =
             views;
         let [critic_inputs, next_noise, noise, previous_actions, has_previous, views @ ..] = views;
-        let [motion, rewards, bootstrap] = views;
+        let [led_to_goal, motion, rewards, bootstrap] = views;
         Ok(DeviceBatch {
             states: self.states(inputs, starts, distances)?,
             next_states: self.states(next_inputs, next_starts, next_distances)?,
@@ -129,6 +132,7 @@ impl Graph {
             noise: noise.transpose()?,
             previous_actions: present(previous_actions)?,
             has_previous: present(has_previous)?,
+            led_to_goal: present(led_to_goal)?,
             motion: motion.transpose()?,
             rewards: present(rewards)?,
             bootstrap: present(bootstrap)?,

@@ -335,8 +335,8 @@ impl Graph {
     }
 
     /// Returns the penalties on a policy's decisions: on the rate and the acceleration of its
-    /// noise-free actions u, (B, K A), and on saturation. They are sums of squares, as means over
-    /// the batch and shares of |Q|.
+    /// noise-free actions u, (B, K A), on their distance from actions that led to the goal, and on
+    /// saturation. They are sums of squares, as means over the batch and shares of |Q|.
     fn penalties(
         &self,
         means: &Means,
@@ -344,12 +344,19 @@ impl Graph {
         batch: &DeviceBatch,
         q_size: &Tensor,
     ) -> Result<Tensor> {
-        let weight = self.config.algorithm.saturation_penalty;
-        let changes = self.action_penalties(u, batch, q_size)?;
-        if weight == 0.0 {
-            return Ok(changes);
+        let algorithm = &self.config.algorithm;
+        let mut penalties = self.action_penalties(u, batch, q_size)?;
+        if algorithm.saturation_penalty > 0.0 {
+            let saturation = means.saturation()?.mul(q_size)?;
+            penalties = (penalties + (saturation * algorithm.saturation_penalty)?)?;
         }
-        changes + (means.saturation()?.mul(q_size)? * weight)?
+        if algorithm.imitates() {
+            let imitated = batch.critic_inputs.narrow(1, self.shape.observation_len, u.dim(1)?)?;
+            let distance = (u - imitated)?.sqr()?.sum_keepdim(1)?;
+            let mean = distance.mul(&batch.led_to_goal)?.mean_all()?.mul(q_size)?;
+            penalties = (penalties + (mean * algorithm.imitation_penalty)?)?;
+        }
+        Ok(penalties)
     }
 
     /// Returns the penalties on changes of the actions u, (B, K A).

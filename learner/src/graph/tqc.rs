@@ -8,8 +8,8 @@
 //!    return, as in SAC (`algorithms::sac`). K = 1 is the published algorithm.
 //! 2. Two critics instead of five, as in sb3-contrib, with the widths of `critic_hidden`.
 //! 3. The losses of the critics are summed, not averaged.
-//! 4. Temperature, target entropy, penalty on changes of actions, normalisation and the outcome
-//!    model are those of our SAC.
+//! 4. Temperature, target entropy, penalties on actions, normalisation and the outcome model are
+//!    those of our SAC.
 
 use candle_core::{D, Module, Result, Tensor};
 use candle_nn::{VarBuilder, seq};

@@ -9,6 +9,7 @@ mod block_store;
 mod episodes;
 mod file;
 mod hindsight;
+mod led_to_goal;
 mod motion;
 mod recent;
 mod region;

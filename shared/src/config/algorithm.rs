@@ -77,6 +77,13 @@ pub struct AlgorithmConfig {
     /// decision that get a tanh: the outputs for goal, weights and rho, and the actions before
     /// their tanh. Where a tanh is flat, an actor no longer learns.
     pub saturation_penalty: f64,
+    /// Weight of a penalty on the distance from actions that led to the goal, in the actor's loss
+    /// (not with `ndp`), relative to the batch's mean |Q|. The penalty is the sum of (u_t - a_t)²
+    /// over a decision's noise-free actions and their dimensions, where a_t are the actions of the
+    /// sampled window. It is for windows that move the achieved goal and whose episode ends at the
+    /// goal, its own or another one of hindsight. It needs hindsight, an environment with a sparse
+    /// goal rule, and `critic = "segment"`.
+    pub imitation_penalty: f64,
     /// Reward of a step that moves the achieved goal and leaves it in the region of desired goals
     /// and starts, in units of the reward of reaching a goal. It is added while less than half of
     /// the recent episodes move it, if goals are drawn when a batch is sampled and the reward is
@@ -170,6 +177,15 @@ impl Default for TqcConfig {
     }
 }
 
+impl AlgorithmConfig {
+    /// Returns whether the actor imitates windows that led to their goal. The critics must see
+    /// whole segments, because the batch has the actions of a window among their inputs.
+    #[must_use]
+    pub fn imitates(&self) -> bool {
+        self.imitation_penalty > 0.0 && self.critic == CriticInput::Segment
+    }
+}
+
 impl Default for AlgorithmConfig {
     fn default() -> Self {
         Self {
@@ -187,6 +203,7 @@ impl Default for AlgorithmConfig {
             action_rate_penalty: 0.2,
             action_acceleration_penalty: 0.0,
             saturation_penalty: 0.0,
+            imitation_penalty: 0.0,
             motion_bonus: 0.0,
             outcome_model: false,
             td3: Td3Config::default(),

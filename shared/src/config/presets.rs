@@ -60,6 +60,7 @@ actor_learning_rate = 0.0003
 batch_size = 128
 action_rate_penalty = 0.0
 saturation_penalty = 0.003
+imitation_penalty = 0.1
 motion_bonus = 1.0
 outcome_model = true
 [algorithm.td3]
@@ -123,6 +124,7 @@ critic_layer_norm = false
 action_rate_penalty = 0.0
 action_acceleration_penalty = 0.0
 saturation_penalty = 0.0
+imitation_penalty = 0.0
 motion_bonus = 0.0
 outcome_model = false
 [algorithm.td3]

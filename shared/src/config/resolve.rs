@@ -370,6 +370,7 @@ mod tests {
             ("algorithm.action_rate_penalty", "-0.1"),
             ("algorithm.action_acceleration_penalty", "inf"),
             ("algorithm.saturation_penalty", "-1"),
+            ("algorithm.imitation_penalty", "-1"),
             ("replay.hindsight_share", "1.1"),
             ("replay.other_goals_share", "1.1"),
             ("replay.near_misses_share", "1.1"),
