@@ -29,8 +29,8 @@ class CardTest(unittest.TestCase):
             '      name: "panda-push"',
             '      type: "dmprl/PandaPush-v0"',
             # The population's deviation of the 100 returns, as `dmprl eval` prints it.
-            '      value: "-15.96 +/- 8.48"',
-            "      value: 0.97",
+            '      value: "-15.20 +/- 7.04"',
+            "      value: 0.99",
         ]:
             self.assertIn(line, head.splitlines())
         self.assertTrue(body.startswith("\n# TD3 policy for panda-push\n"))
@@ -42,13 +42,13 @@ class CardTest(unittest.TestCase):
             "| Algorithm | TD3, policy `dmp`, 5 steps per decision |",
             "| Seed of the training | 1 |",
             "| Environment steps | 200,000 |",
-            "| Return | -15.96 ± 8.48 |",
-            "| Success rate | 0.97 |",
+            "| Return | -15.20 ± 7.04 |",
+            "| Success rate | 0.99 |",
             "| Episodes | 100, without noise, seeds 1000 to 1099 |",
         ]:
             self.assertIn(line, text.splitlines())
         self.assertIn("dmprl train panda-push --seed 1 --steps 200000", text)
-        self.assertIn("commit 275603212865aedc6bcdd129656ab7023af21cd0", text)
+        self.assertIn("commit fe437a55479305e79965391814b7c8a8b7458112", text)
         self.assertIn(f'src="{FILM}"', text)
 
     def test_the_text_shows_how_to_use_the_policy(self):
