@@ -158,8 +158,8 @@ fn a_window_that_reaches_its_new_goal_early_terminates_and_has_no_later_actions(
 #[test]
 fn whole_windows_that_led_to_their_goal_are_imitated() {
     // The final goal is 3, and both windows move towards it.
-    let imitated = |config: AlgorithmConfig, rule: &GoalRule, flag| {
-        let hindsight = GoalSampler::new(Some(rule), Hindsight::Final, 1.0);
+    let imitated_of = |config: AlgorithmConfig, rule: &GoalRule, flag, share| {
+        let hindsight = GoalSampler::new(Some(rule), Hindsight::Final, share);
         let random = dmprl_shared::seeds::stream(1, "test", 0);
         let mut sampler = Sampler::new(Windows::Sliding, random);
         let (mut batch, replay) = (Batch::new(SHAPE), replay(flag));
@@ -176,13 +176,21 @@ fn whole_windows_that_led_to_their_goal_are_imitated() {
         actions.dedup();
         actions
     };
+    let imitated = |config, rule: &GoalRule, flag| imitated_of(config, rule, flag, 1.0);
     let config = AlgorithmConfig { imitation_penalty: 0.1, ..config() };
     let both = [[0.1, 0.2], [0.2, 0.3]];
     assert_eq!(imitated(config.clone(), &rule(None), TRUNCATED), both);
     assert_eq!(imitated(config.clone(), &rule(Some(0.5)), TERMINATED), both);
-    let wide = GoalReward::Sparse { threshold: 1.5, reached: 0.0, missed: -1.0 };
-    let wide = GoalRule { reward: wide, ..rule(Some(1.5)) };
-    assert_eq!(imitated(config, &wide, TERMINATED), both[..1], "the second one ends early");
+    let wide = |threshold, ends_within| {
+        let reward = GoalReward::Sparse { threshold, reached: 0.0, missed: -1.0 };
+        GoalRule { reward, ..rule(ends_within) }
+    };
+    let early = imitated(config.clone(), &wide(1.5, Some(1.5)), TERMINATED);
+    assert_eq!(early, both[..1], "the second one ends early");
+    // The episode's own goal, 9, is reached from 3 on, or not at all.
+    let own = |threshold| imitated_of(config.clone(), &wide(threshold, None), TRUNCATED, 0.0);
+    assert_eq!(own(6.0), both);
+    assert!(own(5.0).is_empty());
     assert!(imitated(self::config(), &rule(None), TRUNCATED).is_empty(), "no penalty");
 }
 
