@@ -25,6 +25,8 @@ mod goal_switching;
 #[cfg(feature = "python")]
 mod hindsight;
 #[cfg(feature = "python")]
+mod hindsight_note;
+#[cfg(feature = "python")]
 pub mod policy_health;
 #[cfg(feature = "python")]
 mod policy_runner;

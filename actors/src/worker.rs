@@ -8,8 +8,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use dmprl_shared::config::{ExperimentConfig, Hindsight};
-use dmprl_shared::goal_rule::{GoalReward, GoalRule};
+use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::seeds;
 use dmprl_shared::supervision::{Activity, Report, ReportError, Supervisor};
 use dmprl_shared::transport::delivery::{Outbox, Sent};
@@ -19,6 +18,7 @@ use thiserror::Error;
 
 use crate::delivery::{ATTACH_LIMIT, ATTACH_PAUSE, Delivery, DeliveryError, DeliveryObserver};
 use crate::environments::{self, EnvironmentsError};
+use crate::hindsight_note::{GoalRewards, hindsight_note};
 use crate::python_env::{Interpreter, PythonEnvironments};
 use crate::rollout::{Identity, Rollout, RolloutError};
 
@@ -100,7 +100,7 @@ pub fn run<T: WorkerTransport>(
     let Worker { config, identity, environments, observer, joined } = worker;
     supervisor.report(&Report::EnvironmentReady { spec: environments.spec().clone() })?;
     if identity.seed_index == 0 && identity.incarnation == 0 {
-        describe_hindsight(config, &environments, supervisor);
+        report_hindsight(config, &environments, supervisor);
     }
     let mut rollout = Rollout::start(config, environments, identity)?;
     let plan = Plan::new(config, identity.run_id, rollout.policy());
@@ -149,31 +149,22 @@ fn work<T: WorkerTransport>(
     Ok(())
 }
 
-/// Tells the user where hindsight takes its rewards from. Without hindsight, suggests it if the
-/// reward is sparse, because random exploration rarely reaches the goal.
-fn describe_hindsight(
+/// Tells the user how the run learns from goals, if there is something to tell.
+fn report_hindsight(
     config: &ExperimentConfig,
     environments: &PythonEnvironments,
     supervisor: &dyn Supervisor,
 ) {
-    let is_off = config.replay.hindsight == Hindsight::None;
-    let message = match (environments.spec().goal_rule.as_deref(), environments.missing_rule()) {
-        (Some(GoalRule { reward: GoalReward::Sparse { threshold, .. }, .. }), _) => format!(
-            "hindsight draws goals for each batch; a goal is reached within {threshold} of it"
-        ),
-        (Some(_), _) => "hindsight draws goals for each batch, with rewards by distance".to_owned(),
-        (None, Some(reason)) => format!(
-            "hindsight: workers make copies, because the reward follows no known rule: {reason}"
-        ),
-        (None, None) if is_off && environments.goals().is_ok_and(|goals| goals.is_sparse) => {
-            "the reward is sparse: it only depends on whether the goal is reached. With --preset \
-             goal (or --set replay.hindsight=future) the run also learns from goals reached by \
-             chance"
-                .to_owned()
-        }
-        _ => return,
+    let rewards = match (environments.spec().goal_rule.as_deref(), environments.missing_rule()) {
+        (Some(rule), _) => GoalRewards::Rule(rule),
+        (None, Some(reason)) => GoalRewards::NoRule(reason),
+        (None, None) => GoalRewards::NotSearched {
+            is_sparse: environments.goals().is_ok_and(|goals| goals.is_sparse),
+        },
     };
-    supervisor.warn(message);
+    if let Some(note) = hindsight_note(config, rewards) {
+        supervisor.warn(note);
+    }
 }
 
 fn await_first_policy<T: WorkerTransport>(

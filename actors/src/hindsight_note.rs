@@ -1,0 +1,138 @@
+//! What a worker says about goals at its start.
+
+use dmprl_shared::config::{ExperimentConfig, Hindsight};
+use dmprl_shared::goal_rule::{GoalReward, GoalRule};
+
+/// What is known about an environment's reward for goals.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum GoalRewards<'a> {
+    /// Hindsight is off, so no rule was searched, or the environment has no goals.
+    NotSearched {
+        /// Whether the reward only depends on whether the goal is reached.
+        is_sparse: bool,
+    },
+    /// The reward follows no known rule, for this reason.
+    NoRule(&'a str),
+    /// The reward follows this rule.
+    Rule(&'a GoalRule),
+}
+
+/// Says where hindsight takes its rewards from, and which settings have no effect. Without
+/// hindsight, suggests it if the reward is sparse, because random exploration rarely reaches the
+/// goal.
+pub(crate) fn hindsight_note(
+    config: &ExperimentConfig,
+    rewards: GoalRewards<'_>,
+) -> Option<String> {
+    let is_off = config.replay.hindsight == Hindsight::None;
+    let (note, idle) = match rewards {
+        GoalRewards::Rule(GoalRule { reward: GoalReward::Sparse { threshold, .. }, .. }) => (
+            format!(
+                "hindsight draws goals for each batch; a goal is reached within {threshold} of it"
+            ),
+            None,
+        ),
+        GoalRewards::Rule(_) => (
+            "hindsight draws goals for each batch, with rewards by distance".to_owned(),
+            idle_settings(config, "with a dense reward", true),
+        ),
+        GoalRewards::NoRule(reason) => (
+            format!(
+                "hindsight: workers make copies, because the reward follows no known rule: {reason}"
+            ),
+            idle_settings(config, "without a rule (docs/environments.md, Rules)", false),
+        ),
+        GoalRewards::NotSearched { is_sparse } => (
+            if is_off && is_sparse {
+                "the reward is sparse: it only depends on whether the goal is reached. With \
+                 --preset goal (or --set replay.hindsight=future) the run also learns from goals \
+                 reached by chance"
+                    .to_owned()
+            } else {
+                String::new()
+            },
+            idle_settings(config, "without hindsight", false),
+        ),
+    };
+    let parts: Vec<String> =
+        [note].into_iter().filter(|note| !note.is_empty()).chain(idle).collect();
+    (!parts.is_empty()).then(|| parts.join("; "))
+}
+
+/// Names the settings in use that have no effect under a condition: those that need a rule for
+/// goals, or with `only_sparse` those that need a sparse one.
+fn idle_settings(config: &ExperimentConfig, condition: &str, only_sparse: bool) -> Option<String> {
+    let ExperimentConfig { algorithm, replay, .. } = config;
+    let names: Vec<&str> = [
+        ("algorithm.imitation_penalty", algorithm.imitation_penalty > 0.0),
+        ("algorithm.motion_bonus", algorithm.motion_bonus > 0.0),
+        ("algorithm.outcome_model", algorithm.outcome_model),
+        ("replay.moved_share", replay.moved_share > 0.0),
+        ("replay.other_goals_share", !only_sparse && replay.other_goals_share > 0.0),
+        ("replay.near_misses_share", !only_sparse && replay.near_misses_share > 0.0),
+    ]
+    .into_iter()
+    .filter_map(|(name, is_idle)| is_idle.then_some(name))
+    .collect();
+    (!names.is_empty()).then(|| format!("no effect {condition}: {}", names.join(", ")))
+}
+
+#[cfg(test)]
+mod tests {
+    use dmprl_shared::goal_rule::Norm;
+
+    use super::*;
+
+    fn with_goal_settings() -> ExperimentConfig {
+        let mut config = ExperimentConfig::default();
+        config.algorithm.imitation_penalty = 0.1;
+        config.algorithm.outcome_model = true;
+        config.replay.near_misses_share = 0.4;
+        config
+    }
+
+    fn rule(reward: GoalReward) -> GoalRule {
+        GoalRule {
+            achieved: 0,
+            desired: 1,
+            goal_len: 1,
+            components: vec![0],
+            norm: Norm::Euclidean,
+            reward,
+            ends_within: None,
+        }
+    }
+
+    #[test]
+    fn settings_without_effect_are_named() {
+        let config = with_goal_settings();
+        let dense = rule(GoalReward::Dense { factor: -1.0 });
+        let no_rule = GoalRewards::NoRule("it is 3");
+        let [plain, sparse] = [false, true].map(|is_sparse| GoalRewards::NotSearched { is_sparse });
+        for (rewards, expected) in [
+            (plain, "no effect without hindsight: algorithm.imitation_penalty, "),
+            (sparse, "--preset goal"),
+            (sparse, "; no effect without hindsight: algorithm.imitation_penalty"),
+            (no_rule, "no known rule: it is 3; no effect without a rule"),
+            (no_rule, "algorithm.outcome_model, replay.near_misses_share"),
+            (GoalRewards::Rule(&dense), "with a dense reward: algorithm.imitation_penalty, "),
+        ] {
+            let note = hindsight_note(&config, rewards).unwrap();
+            assert!(note.contains(expected), "{note}\nexpected: {expected}");
+        }
+        let note = hindsight_note(&config, GoalRewards::Rule(&dense)).unwrap();
+        assert!(!note.contains("near_misses"), "{note}");
+    }
+
+    #[test]
+    fn nothing_is_said_without_such_settings_or_if_they_have_an_effect() {
+        let config = ExperimentConfig::default();
+        assert_eq!(hindsight_note(&config, GoalRewards::NotSearched { is_sparse: false }), None);
+        let sparse = rule(GoalReward::Sparse { threshold: 0.05, reached: 0.0, missed: -1.0 });
+        let note = hindsight_note(&with_goal_settings(), GoalRewards::Rule(&sparse)).unwrap();
+        assert_eq!(
+            note,
+            "hindsight draws goals for each batch; a goal is reached within 0.05 of it"
+        );
+    }
+}
