@@ -4,7 +4,7 @@
 //! Its metadata contain the policy's description (environment, DMP, ranges, controller, start) as
 //! JSON. The tensor `segment_map` is the DMP as one matrix, so that readers need no integrator.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fs;
 use std::io;
 use std::path::Path;
@@ -21,6 +21,8 @@ const FORMAT: &str = "dmprl-policy-1";
 /// Version of the format of a file with a hold. Earlier programs reject it, because they would hold
 /// the robot with another action.
 const FORMAT_WITH_HOLD: &str = "dmprl-policy-2";
+/// Bytes before a file's header, which contain its length.
+const HEADER_LENGTH_LEN: usize = 8;
 const FORMAT_KEY: &str = "format";
 const HASH_KEY: &str = "architecture_hash";
 const VERSION_KEY: &str = "policy_version";
@@ -152,7 +154,24 @@ pub fn encode(
     if let Some(origin) = origin {
         metadata.insert(ORIGIN_KEY.to_owned(), json(serde_json::to_string(origin))?);
     }
-    safetensors::serialize(tensors, Some(metadata)).map_err(|e| format_error(path, e))
+    let mut bytes =
+        safetensors::serialize(tensors, Some(metadata)).map_err(|e| format_error(path, e))?;
+    sort_header(&mut bytes).map_err(|e| format_error(path, e))?;
+    Ok(bytes)
+}
+
+/// Sorts the header of an encoded file by names, so that equal policies have equal files. The crate
+/// writes the metadata in an order that changes from call to call.
+fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
+    let (length, rest) = bytes.split_at_mut(HEADER_LENGTH_LEN);
+    let length = length.iter().rev().fold(0, |sum, &byte| sum << 8 | usize::from(byte));
+    let header = &mut rest[..length];
+    let fields: BTreeMap<&str, BTreeMap<&str, serde_json::Value>> = serde_json::from_slice(header)?;
+    let sorted = serde_json::to_vec(&fields)?;
+    let (json, padding) = header.split_at_mut(sorted.len());
+    json.copy_from_slice(&sorted);
+    padding.fill(b' ');
+    Ok(())
 }
 
 /// Returns the CRC-32 of the description, of the hold, and of the tensors' bytes in the order of
