@@ -205,9 +205,21 @@ pub struct Process {
 }
 
 impl Process {
-    /// Sends a signal; ignores a process that has ended.
+    /// Sends a signal; ignores a process that has ended. After `STOP`, waits until no thread runs,
+    /// because a thread first ends its system call, such as the renaming of a checkpoint.
+    ///
+    /// # Panics
+    /// If a thread still runs after [`PATIENCE`].
     pub fn signal(&self, signal: Signal) {
         let _ = kill_process(self.id, signal);
+        if signal == Signal::STOP {
+            let threads = PathBuf::from(format!("/proc/{}/task", self.id.as_raw_nonzero()));
+            until(&format!("all threads of {self:?} stopped"), || {
+                let mut states =
+                    numbered(&threads).into_iter().filter_map(|path| thread_state(&path));
+                states.all(|(_, state, _)| state == 'T' || is_gone(state))
+            });
+        }
     }
 
     /// Returns the processor time of all threads, user and system [clock ticks].
@@ -223,22 +235,24 @@ impl Process {
 /// Returns true if a `dmprl` has lost its command line but not all of its files: one of its threads
 /// is exiting.
 fn any_is_dying() -> bool {
-    let ids = |path: &Path| {
-        let entries = fs::read_dir(path).into_iter().flatten().flatten();
-        entries
-            .filter(|entry| entry.file_name().as_encoded_bytes().iter().all(u8::is_ascii_digit))
-            .map(|entry| entry.path())
-            .collect::<Vec<_>>()
-    };
-    ids(Path::new("/proc")).into_iter().any(|process| {
+    numbered(Path::new("/proc")).into_iter().any(|process| {
         let Some((name, state, _)) = thread_state(&process) else { return false };
-        let threads = ids(&process.join("task"));
+        let threads = numbered(&process.join("task"));
         name.contains("dmprl")
             && threads
                 .iter()
                 .filter_map(|thread| thread_state(thread))
                 .any(|(_, own, exiting)| !is_gone(own) && (exiting || is_gone(state)))
     })
+}
+
+/// Returns the entries of a folder whose names are numbers, such as processes or threads.
+fn numbered(folder: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    entries
+        .filter(|entry| entry.file_name().as_encoded_bytes().iter().all(u8::is_ascii_digit))
+        .map(|entry| entry.path())
+        .collect()
 }
 
 fn is_gone(state: char) -> bool {
