@@ -1,9 +1,9 @@
-//! What a worker says about goals at its start.
+//! A worker's note about goals at its start.
 
 use dmprl_shared::config::{ExperimentConfig, Hindsight};
 use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 
-/// What is known about an environment's reward for goals.
+/// The source of an environment's rewards for goals.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum GoalRewards<'a> {
     /// Hindsight is off, so no rule was searched, or the environment has no goals.
