@@ -1,13 +1,13 @@
-//! A worker's note about goals at its start.
+//! The line that a worker prints about hindsight at its start.
 
-use dmprl_shared::config::{ExperimentConfig, Hindsight};
+use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 
 /// The source of an environment's rewards for goals.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum GoalRewards<'a> {
-    /// Hindsight is off, so no rule was searched, or the environment has no goals.
-    NotSearched {
+    /// Hindsight is off. The environment may have no goals.
+    NoHindsight {
         /// Whether the reward only depends on whether the goal is reached.
         is_sparse: bool,
     },
@@ -24,43 +24,39 @@ pub(crate) fn hindsight_note(
     config: &ExperimentConfig,
     rewards: GoalRewards<'_>,
 ) -> Option<String> {
-    let is_off = config.replay.hindsight == Hindsight::None;
     let (note, idle) = match rewards {
         GoalRewards::Rule(GoalRule { reward: GoalReward::Sparse { threshold, .. }, .. }) => (
-            format!(
+            Some(format!(
                 "hindsight draws goals for each batch; a goal is reached within {threshold} of it"
-            ),
+            )),
             None,
         ),
         GoalRewards::Rule(_) => (
-            "hindsight draws goals for each batch, with rewards by distance".to_owned(),
+            Some("hindsight draws goals for each batch, with rewards by distance".to_owned()),
             idle_settings(config, "with a dense reward", true),
         ),
         GoalRewards::NoRule(reason) => (
-            format!(
+            Some(format!(
                 "hindsight: workers make copies, because the reward follows no known rule: {reason}"
-            ),
+            )),
             idle_settings(config, "without a rule (docs/environments.md, Rules)", false),
         ),
-        GoalRewards::NotSearched { is_sparse } => (
-            if is_off && is_sparse {
+        GoalRewards::NoHindsight { is_sparse } => (
+            is_sparse.then(|| {
                 "the reward is sparse: it only depends on whether the goal is reached. With \
                  --preset goal (or --set replay.hindsight=future) the run also learns from goals \
                  reached by chance"
                     .to_owned()
-            } else {
-                String::new()
-            },
+            }),
             idle_settings(config, "without hindsight", false),
         ),
     };
-    let parts: Vec<String> =
-        [note].into_iter().filter(|note| !note.is_empty()).chain(idle).collect();
+    let parts: Vec<String> = note.into_iter().chain(idle).collect();
     (!parts.is_empty()).then(|| parts.join("; "))
 }
 
-/// Names the settings in use that have no effect under a condition: those that need a rule for
-/// goals, or with `only_sparse` those that need a sparse one.
+/// Names the settings that are set and have no effect under a condition: all that need a rule for
+/// goals, or with `only_sparse` only those that need a sparse one.
 fn idle_settings(config: &ExperimentConfig, condition: &str, only_sparse: bool) -> Option<String> {
     let ExperimentConfig { algorithm, replay, .. } = config;
     let names: Vec<&str> = [
@@ -72,7 +68,7 @@ fn idle_settings(config: &ExperimentConfig, condition: &str, only_sparse: bool) 
         ("replay.near_misses_share", !only_sparse && replay.near_misses_share > 0.0),
     ]
     .into_iter()
-    .filter_map(|(name, is_idle)| is_idle.then_some(name))
+    .filter_map(|(name, is_set)| is_set.then_some(name))
     .collect();
     (!names.is_empty()).then(|| format!("no effect {condition}: {}", names.join(", ")))
 }
@@ -108,7 +104,7 @@ mod tests {
         let config = with_goal_settings();
         let dense = rule(GoalReward::Dense { factor: -1.0 });
         let no_rule = GoalRewards::NoRule("it is 3");
-        let [plain, sparse] = [false, true].map(|is_sparse| GoalRewards::NotSearched { is_sparse });
+        let [plain, sparse] = [false, true].map(|is_sparse| GoalRewards::NoHindsight { is_sparse });
         for (rewards, expected) in [
             (plain, "no effect without hindsight: algorithm.imitation_penalty, "),
             (sparse, "--preset goal"),
@@ -125,9 +121,9 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_said_without_such_settings_or_if_they_have_an_effect() {
+    fn settings_that_have_an_effect_are_not_named() {
         let config = ExperimentConfig::default();
-        assert_eq!(hindsight_note(&config, GoalRewards::NotSearched { is_sparse: false }), None);
+        assert_eq!(hindsight_note(&config, GoalRewards::NoHindsight { is_sparse: false }), None);
         let sparse = rule(GoalReward::Sparse { threshold: 0.05, reached: 0.0, missed: -1.0 });
         let note = hindsight_note(&with_goal_settings(), GoalRewards::Rule(&sparse)).unwrap();
         assert_eq!(

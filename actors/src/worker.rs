@@ -158,7 +158,7 @@ fn report_hindsight(
     let rewards = match (environments.spec().goal_rule.as_deref(), environments.missing_rule()) {
         (Some(rule), _) => GoalRewards::Rule(rule),
         (None, Some(reason)) => GoalRewards::NoRule(reason),
-        (None, None) => GoalRewards::NotSearched {
+        (None, None) => GoalRewards::NoHindsight {
             is_sparse: environments.goals().is_ok_and(|goals| goals.is_sparse),
         },
     };

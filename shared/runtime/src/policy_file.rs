@@ -21,8 +21,8 @@ const FORMAT: &str = "dmprl-policy-1";
 /// Version of the format of a file with a hold. Earlier programs reject it, because they would hold
 /// the robot with another action.
 const FORMAT_WITH_HOLD: &str = "dmprl-policy-2";
-/// Bytes before a file's header, which contain its length.
-const HEADER_LENGTH_LEN: usize = 8;
+/// First byte of a file's header, after the header's length.
+const HEADER_START: usize = 8;
 const FORMAT_KEY: &str = "format";
 const HASH_KEY: &str = "architecture_hash";
 const VERSION_KEY: &str = "policy_version";
@@ -156,16 +156,14 @@ pub fn encode(
     }
     let mut bytes =
         safetensors::serialize(tensors, Some(metadata)).map_err(|e| format_error(path, e))?;
-    sort_header(&mut bytes).map_err(|e| format_error(path, e))?;
+    let (length, _) = SafeTensors::read_metadata(&bytes).map_err(|e| format_error(path, e))?;
+    sort_header(&mut bytes[HEADER_START..][..length]).map_err(|e| format_error(path, e))?;
     Ok(bytes)
 }
 
-/// Sorts the header of an encoded file by names, so that equal policies have equal files. The crate
-/// writes the metadata in an order that changes from call to call.
-fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
-    let (length, rest) = bytes.split_at_mut(HEADER_LENGTH_LEN);
-    let length = length.iter().rev().fold(0, |sum, &byte| sum << 8 | usize::from(byte));
-    let header = &mut rest[..length];
+/// Sorts a file's header by names, so that equal policies have equal files. The crate writes the
+/// metadata in an order that changes from call to call.
+fn sort_header(header: &mut [u8]) -> serde_json::Result<()> {
     let fields: BTreeMap<&str, BTreeMap<&str, serde_json::Value>> = serde_json::from_slice(header)?;
     let sorted = serde_json::to_vec(&fields)?;
     let (json, padding) = header.split_at_mut(sorted.len());
