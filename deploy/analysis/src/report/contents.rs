@@ -1,5 +1,6 @@
 //! The content of a report, which the output modules write.
 
+use super::curves::Curves;
 use super::efficiency::EfficiencyRow;
 use super::filmstrips::Filmstrip;
 use super::layout::Picture;
@@ -26,7 +27,7 @@ pub struct Report {
     /// The paper's statements with their verdicts.
     pub claims: PaperClaims,
     /// Learning curves.
-    pub curves: Vec<Picture>,
+    pub curves: Curves,
     /// Return against smoothness, if asked for.
     pub pareto: Vec<Picture>,
     /// Frames of a rollout.

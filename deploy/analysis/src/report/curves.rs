@@ -33,31 +33,60 @@ struct Point {
     high: f64,
 }
 
+/// Learning curves, one per task and measure.
+#[derive(Debug, Clone, Default)]
+pub struct Curves {
+    /// The success rate of each task, or the return if the task does not report it.
+    pub main: Vec<Picture>,
+    /// The return of tasks that report a success rate.
+    pub others: Vec<Picture>,
+}
+
+impl Curves {
+    /// Returns all pictures.
+    pub fn all(&self) -> impl Iterator<Item = &Picture> {
+        self.main.iter().chain(&self.others)
+    }
+}
+
 /// Draws the return of each task, and the success rate if the task reports it.
 ///
 /// # Errors
 /// A picture cannot be drawn.
-pub fn curves(results: &Results) -> anyhow::Result<Vec<Picture>> {
-    let mut curves = Vec::new();
+pub fn curves(results: &Results) -> anyhow::Result<Curves> {
+    let mut curves = Curves::default();
     for task in &results.tasks {
-        for (what, measure) in
-            [("evaluation return", Measure::Return), ("success rate", Measure::Success)]
-        {
-            let lines: Vec<MethodLine> = (0..results.methods.len())
-                .map(|index| MethodLine::new(results, task, index, measure))
-                .filter(|line| !line.points.is_empty())
-                .collect();
-            if lines.is_empty() {
-                continue;
-            }
-            let svg = draw(task, what, &lines)
-                .map_err(|error| anyhow!("cannot draw the curves of {task}: {error}"))?;
-            let path = format!("curves/{}-{}", safe_name(task), what.replace(' ', "-"));
-            let alt = format!("{task}: {what} over environment steps");
-            curves.push(Picture { path, alt, svg });
+        let success = curve(results, task, "success rate", Measure::Success)?;
+        let returns = curve(results, task, "evaluation return", Measure::Return)?;
+        if success.is_some() {
+            curves.main.extend(success);
+            curves.others.extend(returns);
+        } else {
+            curves.main.extend(returns);
         }
     }
     Ok(curves)
+}
+
+/// Draws the curves of a task; `None` if no run has the measure.
+fn curve(
+    results: &Results,
+    task: &str,
+    what: &str,
+    measure: Measure,
+) -> anyhow::Result<Option<Picture>> {
+    let lines: Vec<MethodLine> = (0..results.methods.len())
+        .map(|index| MethodLine::new(results, task, index, measure))
+        .filter(|line| !line.points.is_empty())
+        .collect();
+    if lines.is_empty() {
+        return Ok(None);
+    }
+    let svg = draw(task, what, &lines)
+        .map_err(|error| anyhow!("cannot draw the curves of {task}: {error}"))?;
+    let path = format!("curves/{}-{}", safe_name(task), what.replace(' ', "-"));
+    let alt = format!("{task}: {what} over environment steps");
+    Ok(Some(Picture { path, alt, svg }))
 }
 
 /// Averages the n-th evaluations of all seeds, which differ by less than a segment in their steps.

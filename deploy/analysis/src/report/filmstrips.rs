@@ -23,6 +23,10 @@ const BASELINE: &str = "DDPG";
 /// A row of frames.
 #[derive(Debug, Clone, Serialize)]
 pub struct Filmstrip {
+    /// Task.
+    pub task: String,
+    /// Method.
+    pub method: String,
     /// Path relative to the folder of the report, without the extension.
     pub path: String,
     /// Alternative text.
@@ -32,6 +36,13 @@ pub struct Filmstrip {
     pub png: Vec<u8>,
     /// The same in Base64, for the page.
     pub base64: String,
+}
+
+impl Filmstrip {
+    /// Returns true if the other is of the same task.
+    pub(super) fn is_of_same_task(&self, other: &Self) -> bool {
+        self.task == other.task
+    }
 }
 
 /// A filmstrip that the report shows if its file exists.
@@ -133,6 +144,8 @@ pub fn read_filmstrips(planned: &[PlannedFilmstrip]) -> anyhow::Result<Vec<Films
         let PlannedFilmstrip { task, method, file, .. } = filmstrip;
         let png = std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))?;
         Ok(Filmstrip {
+            task: task.clone(),
+            method: method.clone(),
             path: path(task, method),
             alt: format!("{task}: frames of a rollout of {method}"),
             base64: STANDARD.encode(&png),
@@ -161,7 +174,7 @@ fn best_dmp<'r>(results: &'r Results, task: &str) -> Option<&'r Run> {
 }
 
 /// Returns the finished run of a method with the lowest seed.
-fn first_run<'r>(results: &'r Results, task: &str, method: &str) -> Option<&'r Run> {
+pub(super) fn first_run<'r>(results: &'r Results, task: &str, method: &str) -> Option<&'r Run> {
     let finished = results.runs.iter().filter(|run| run.last().is_some());
     let runs = finished.filter(|run| run.task == task && run.method == method);
     runs.min_by_key(|run| run.seed)

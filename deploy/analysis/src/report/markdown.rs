@@ -1,8 +1,8 @@
 //! Writes a report as Markdown.
 
 use super::contents::Report;
-use super::layout::Grid;
-use super::sections::{Section, TABLES_NOTE, sections};
+use super::layout::{Grid, GridCell, GridRow, Picture};
+use super::sections::{Section, Text};
 use super::statements::ClaimResult;
 
 /// Returns the content of `report.md`.
@@ -12,17 +12,31 @@ pub fn markdown(report: &Report) -> String {
     if let Some(commit) = &report.commit {
         text.push_str(&format!(", commit {commit}"));
     }
-    text.push_str(".\n\nIn the tables: ");
-    text.push_str(TABLES_NOTE);
-    text.push('\n');
-    for section in sections(report) {
-        text.push_str(&section_text(&section));
+    text.push_str(".\n");
+    let Text { summary, main, details } = Text::of(report);
+    for paragraph in &summary {
+        text.push_str(&format!("\n{paragraph}\n"));
+    }
+    for section in &main {
+        text.push_str(&format!("\n## {}\n{}", section.title, section_text(section)));
+    }
+    text.push_str("\n## Details\n");
+    for section in &details {
+        text.push_str(&folded(&section.title, &section_text(section)));
     }
     text
 }
 
+/// Returns text that a click on its summary shows.
+fn folded(summary: &str, text: &str) -> String {
+    format!("\n<details><summary>{summary}</summary>\n{text}\n</details>\n")
+}
+
 fn section_text(section: &Section) -> String {
-    let mut text = format!("\n## {}\n", section.title);
+    let mut text = String::new();
+    if let Some(finding) = &section.finding {
+        text.push_str(&format!("\n**{finding}**\n"));
+    }
     for paragraph in &section.about {
         text.push_str(&format!("\n{paragraph}\n"));
     }
@@ -32,20 +46,31 @@ fn section_text(section: &Section) -> String {
     if !section.statements.is_empty() {
         text.push_str(&statements_text(&section.statements));
     }
-    for picture in &section.pictures {
-        text.push_str(&format!("\n![{}]({}.svg)\n", picture.alt, picture.path));
-    }
-    for filmstrip in &section.filmstrips {
-        text.push_str(&format!("\n![{}]({}.png)\n", filmstrip.alt, filmstrip.path));
+    text.push_str(&pictures_text(&section.pictures));
+    for filmstrips in &section.filmstrips {
+        text.push('\n');
+        for filmstrip in filmstrips {
+            text.push_str(&format!("![{}]({}.png)\n", filmstrip.alt, filmstrip.path));
+        }
     }
     for (name, file) in &section.files {
-        text.push_str(&format!(
-            "\n<details><summary>The sweep <code>{name}</code></summary>\n\n```toml\n{}\n```\n\n\
-             </details>\n",
-            file.trim_end()
-        ));
+        let summary = format!("The sweep <code>{name}</code>");
+        text.push_str(&folded(&summary, &format!("\n```toml\n{}\n```\n", file.trim_end())));
     }
     text
+}
+
+/// Shows pictures in pairs. Markdown has no width of pictures, so this is HTML.
+fn pictures_text(pictures: &[Picture]) -> String {
+    let picture = |picture: &Picture| {
+        let Picture { path, alt, .. } = picture;
+        format!("<img src=\"{path}.svg\" alt=\"{alt}\" width=\"49%\">")
+    };
+    let pairs = pictures.chunks(2).map(|pair| {
+        let pair: Vec<_> = pair.iter().map(picture).collect();
+        format!("\n<p>{}</p>\n", pair.join("\n"))
+    });
+    pairs.collect()
 }
 
 fn grid_text(grid: &Grid) -> String {
@@ -55,9 +80,20 @@ fn grid_text(grid: &Grid) -> String {
     let head = std::iter::once("Task").chain(grid.columns.iter().map(String::as_str));
     text.push_str(&cells(head.map(cell).collect()));
     text.push_str(&cells(vec!["|---".to_owned(); grid.columns.len() + 1]));
-    for (task, row) in &grid.rows {
-        let row = row.iter().map(|lines| cell(&lines.join("<br>")));
-        text.push_str(&cells(std::iter::once(cell(task)).chain(row).collect()));
+    for GridRow { name, cells: row } in &grid.rows {
+        let row = row.iter().map(|GridCell { lines, is_best }| {
+            let lines: Vec<_> = lines
+                .iter()
+                .enumerate()
+                .map(
+                    |(index, line)| {
+                        if *is_best && index == 0 { format!("**{line}**") } else { line.clone() }
+                    },
+                )
+                .collect();
+            cell(&lines.join("<br>"))
+        });
+        text.push_str(&cells(std::iter::once(cell(name)).chain(row).collect()));
     }
     text
 }

@@ -83,14 +83,8 @@ impl Measure {
     #[must_use]
     pub fn about(self) -> &'static str {
         match self {
-            Self::Return => {
-                "Mean return of the last evaluation, without exploration noise, as in the paper's \
-                 Table 3."
-            }
-            Self::Success => {
-                "Fraction of the last evaluation's episodes that end in success, as in the paper's \
-                 Table 4."
-            }
+            Self::Return => "Mean return of the last evaluation, without exploration noise.",
+            Self::Success => "Fraction of the last evaluation's episodes that end in success.",
             Self::ActionChange => {
                 "Mean absolute change of the actions between two steps of the last evaluation, \
                  with actions scaled to [-1, 1]. Lower is smoother."

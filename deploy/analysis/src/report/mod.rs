@@ -10,7 +10,8 @@
 //!   them over seeds, `provenance` counts the program versions behind them.
 //! - Comparison: `tables`, `efficiency`, `curves`, `pareto`, `trajectories`, `filmstrips` and
 //!   `statements` compare methods, with the elements of `layout`.
-//! - Output: `contents` combines the parts, `sections` orders them for `page` and `markdown`.
+//! - Output: `contents` combines the parts, `findings` states a conclusion of each, `sections`
+//!   orders them for `page` and `markdown`.
 //!   `csv_files` and `snapshot` write the data for other programs and later reports.
 //!
 //! The module only reads and writes files. Where a policy must be rolled out, the caller passes a
@@ -22,6 +23,7 @@ mod csv_files;
 mod curves;
 mod efficiency;
 mod filmstrips;
+mod findings;
 #[cfg(test)]
 mod fixtures;
 mod layout;
@@ -45,7 +47,7 @@ mod thresholds;
 mod trajectories;
 
 pub use contents::Report;
-pub use curves::curves;
+pub use curves::{Curves, curves};
 pub use efficiency::{EfficiencyCell, EfficiencyRow, efficiency};
 pub use filmstrips::{
     Filmstrip, PlannedFilmstrip, missing_filmstrips, needs_recording, plan_filmstrips,

@@ -1,4 +1,5 @@
-//! Summarises the runs: how many are finished, when they started, and on which machines.
+//! Summarises the runs: how many are finished, when they started, on which machines, and missing
+//! measurements and pictures.
 
 use dmprl_run::format::grouped;
 
@@ -6,9 +7,9 @@ use super::layout::Grid;
 use super::results::Results;
 use super::run::Run;
 
-/// Returns the sentences at the top of a report.
+/// Returns a paragraph: how many runs are finished, when they started and on which machines.
 #[must_use]
-pub fn sentences(results: &Results) -> Vec<String> {
+pub fn summary(results: &Results) -> String {
     let ended = results.runs.iter().filter(|run| run.ended).count();
     let unfinished = results.runs.len() - ended;
     let not_started = results.not_started.len();
@@ -20,7 +21,6 @@ pub fn sentences(results: &Results) -> Vec<String> {
         }
     }
     runs.push('.');
-    let mut sentences = vec![runs];
     let mut started: Vec<&str> =
         results.runs.iter().map(|run| run.origin.started.as_str()).collect();
     started.sort_unstable();
@@ -30,10 +30,16 @@ pub fn sentences(results: &Results) -> Vec<String> {
         } else {
             format!("between {first} and {last}")
         };
-        sentences.push(format!("Started {span}."));
+        runs.push_str(&format!(" Started {span}."));
     }
     let machines = results.runs.iter().map(|run| run.origin.machine.clone());
-    sentences.push(format!("Trained on {}.", distinct(machines)));
+    format!("{runs} Trained on {}.", distinct(machines))
+}
+
+/// Returns sentences about motions that were not measured and pictures that were not drawn.
+#[must_use]
+pub fn omissions(results: &Results) -> Vec<String> {
+    let mut sentences = Vec::new();
     if let Some(first) = results.unmeasured.first() {
         let count = match results.unmeasured.len() {
             1 => "1 run".to_owned(),
@@ -110,10 +116,13 @@ mod tests {
         for (run, machine) in results.runs.iter_mut().zip(["a", "b", "a"]) {
             run.origin.machine = machine.to_owned();
         }
-        let sentences = sentences(&results);
-        assert_eq!(sentences[0], "2 of 10 runs are finished, 1 unfinished, 7 not started.");
-        assert_eq!(sentences[2], "Trained on a; b.");
+        let summary = summary(&results);
+        let runs = "2 of 10 runs are finished, 1 unfinished, 7 not started. Started ";
+        assert!(summary.starts_with(runs) && summary.ends_with(" Trained on a; b."), "{summary}");
         let grid = runs_table(&results);
-        assert_eq!(grid.rows[0].1[0], ["seeds 1, 2", "unfinished: seed 3", "2,000 steps each"]);
+        assert_eq!(
+            grid.rows[0].cells[0].lines,
+            ["seeds 1, 2", "unfinished: seed 3", "2,000 steps each"]
+        );
     }
 }

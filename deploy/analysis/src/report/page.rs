@@ -10,7 +10,7 @@ use minijinja::{AutoEscape, Environment, context};
 use super::contents::Report;
 use super::csv_files::{figures_csv, runs_csv};
 use super::markdown::markdown;
-use super::sections::{TABLES_NOTE, sections};
+use super::sections::Text;
 use super::snapshot;
 use crate::plots::png;
 
@@ -23,7 +23,7 @@ impl Report {
     /// # Errors
     /// A picture cannot be rendered, or a file cannot be written.
     pub fn write(&self, folder: &Path) -> anyhow::Result<()> {
-        for picture in self.curves.iter().chain(&self.pareto).chain(&self.trajectories) {
+        for picture in self.curves.all().chain(&self.pareto).chain(&self.trajectories) {
             let file = |ending: &str| folder.join(format!("{}.{ending}", picture.path));
             let svg = file("svg");
             create_parent(&svg)?;
@@ -48,13 +48,15 @@ impl Report {
         let mut environment = Environment::new();
         environment.set_auto_escape_callback(|_| AutoEscape::Html);
         environment.add_template("page", TEMPLATE).context("the report's template is invalid")?;
+        let text = Text::of(self);
         let page = environment.get_template("page")?.render(context! {
             title => self.title.clone(),
             command => self.command.clone(),
             made => self.made.clone(),
             commit => self.commit.clone(),
-            tables_note => TABLES_NOTE,
-            sections => Serde(sections(self)),
+            summary => text.summary,
+            main => Serde(text.main),
+            details => Serde(text.details),
         });
         page.context("cannot render the report's page")
     }

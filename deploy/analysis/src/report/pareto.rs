@@ -18,10 +18,7 @@ use crate::plots::{Bounded, Scatter, ScatterPanel, ScatterPoint, colour};
 pub fn pareto(results: &Results) -> anyhow::Result<Vec<Picture>> {
     let mut pictures = Vec::new();
     for task in &results.tasks {
-        let has_success = results.runs.iter().any(|run| {
-            run.task == *task && run.last().is_some_and(|row| row.success_rate.is_some())
-        });
-        let vertical = if has_success { Measure::Success } else { Measure::Return };
+        let vertical = vertical(results, task);
         let measures = Measure::TABLES.into_iter();
         let panels: Vec<ScatterPanel> = measures
             .filter(|measure| measure.kind() == MeasureKind::Smoothness)
@@ -46,21 +43,66 @@ pub fn pareto(results: &Results) -> anyhow::Result<Vec<Picture>> {
     Ok(pictures)
 }
 
-/// Returns the panel of a measure, with the methods that have a run of which both are known.
-fn panel(results: &Results, task: &str, measure: Measure, vertical: Measure) -> ScatterPanel {
-    let mut points = Vec::new();
-    for (index, method) in results.methods.iter().enumerate() {
+/// Returns the measure on the vertical axis of a task's panels.
+fn vertical(results: &Results, task: &str) -> Measure {
+    let has_success = results
+        .runs
+        .iter()
+        .any(|run| run.task == *task && run.last().is_some_and(|row| row.success_rate.is_some()));
+    if has_success { Measure::Success } else { Measure::Return }
+}
+
+/// Returns the indices of the methods that no other beats in both, `measure` and the result, in the
+/// order of the report. There are none if fewer than two methods have a point.
+pub(super) fn unbeaten(results: &Results, task: &str, measure: Measure) -> Vec<usize> {
+    let points = points(results, task, measure, vertical(results, task));
+    if points.len() < 2 {
+        return Vec::new();
+    }
+    let front = front_of(&points, measure);
+    let unbeaten = points.iter().filter(|point| front.contains(&point.place()));
+    unbeaten.map(|point| point.method_index).collect()
+}
+
+/// The point of a method.
+struct MethodPoint {
+    method_index: usize,
+    x: Bounded,
+    y: Bounded,
+}
+
+impl MethodPoint {
+    fn place(&self) -> (f64, f64) {
+        (self.x.value, self.y.value)
+    }
+}
+
+/// Returns the points of the methods that have a run of which both measures are known.
+fn points(results: &Results, task: &str, measure: Measure, vertical: Measure) -> Vec<MethodPoint> {
+    let point = |(method_index, method): (usize, &String)| {
         let values = |run: &Run| Some((measure.of(run)?, vertical.of(run)?));
         let (x, y): (Vec<_>, Vec<_>) = results.of(task, method).filter_map(values).unzip();
-        if let (Some(x), Some(y)) = (Summary::of(&x), Summary::of(&y)) {
-            points.push(ScatterPoint { colour: colour(index, method), x: x.into(), y: y.into() });
-        }
-    }
-    let places: Vec<_> = points.iter().map(|point| (point.x.value, point.y.value)).collect();
+        Some(MethodPoint { method_index, x: Summary::of(&x)?.into(), y: Summary::of(&y)?.into() })
+    };
+    results.methods.iter().enumerate().filter_map(point).collect()
+}
+
+fn front_of(points: &[MethodPoint], measure: Measure) -> Vec<(f64, f64)> {
+    front(points.iter().map(MethodPoint::place).collect(), measure.higher_is_better())
+}
+
+/// Returns the panel of a measure.
+fn panel(results: &Results, task: &str, measure: Measure, vertical: Measure) -> ScatterPanel {
+    let points = points(results, task, measure, vertical);
+    let drawn = points.iter().map(|&MethodPoint { method_index, x, y }| ScatterPoint {
+        colour: colour(method_index, &results.methods[method_index]),
+        x,
+        y,
+    });
     ScatterPanel {
         x_label: measure.title().trim_start_matches("Smoothness: ").to_owned(),
-        points,
-        front: front(places, measure.higher_is_better()),
+        points: drawn.collect(),
+        front: front_of(&points, measure),
     }
 }
 

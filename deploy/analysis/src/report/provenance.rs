@@ -154,10 +154,10 @@ mod tests {
              [2] dmprl 0.1.0 (commit 1); then 0.1.0 (commit 2); package versions not recorded. \
              [3] dmprl 0.1.0 (commit 1); Python 3.11.7."
         );
-        let (_, cells) = &provenance.grid.rows[0];
+        let cells = &provenance.grid.rows[0].cells;
         let expected = ["[1]: seeds 1, 2", "[2]: seed 3", "motion: seed 2", "rollout: seed 2"];
-        assert_eq!(cells[0], expected);
-        assert_eq!(cells[1], ["[3]: seed 1"]);
-        assert_eq!(provenance.grid.rows[1].1[0], ["not run"]);
+        assert_eq!(cells[0].lines, expected);
+        assert_eq!(cells[1].lines, ["[3]: seed 1"]);
+        assert_eq!(provenance.grid.rows[1].cells[0].lines, ["not run"]);
     }
 }

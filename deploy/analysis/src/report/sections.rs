@@ -1,49 +1,50 @@
-//! The sections of a report, in order, for the web page and for Markdown.
+//! The text of a report for the web page and for Markdown: tables and figures of the paper, then
+//! details.
 
 use dmprl_run::safe_name;
 use serde::Serialize;
 
 use super::contents::Report;
-use super::efficiency::{EfficiencyCell, EfficiencyRow};
+use super::efficiency::EfficiencyRow;
 use super::filmstrips::Filmstrip;
-use super::layout::{Grid, Picture};
-use super::measures::MeasureKind;
-use super::overview::{runs_table, sentences};
-use super::paper;
+use super::layout::{Grid, GridCell, GridRow, Picture};
+use super::measures::{Measure, MeasureKind};
 use super::provenance::Provenance;
 use super::results::Results;
 use super::statements::{
     ClaimResult, EPISODES_MIN, Limits, PaperClaims, SEEDS_MIN, SUBJECTS, counts,
 };
 use super::tables::Table;
+use super::{findings, overview, paper};
 
-/// Explains the cells of the tables.
-pub(super) const TABLES_NOTE: &str = "mean ± standard deviation over seeds. With four or more \
-    seeds, IQM is the interquartile mean with its 95 % interval by stratified bootstrap; with \
-    fewer, the range over the seeds is given instead. Only finished runs are included. † marks \
-    figures over runs with different program or package versions, or over runs that did not \
-    record them; see Provenance.";
+/// Explains the tables.
+const TABLES_NOTE: &str = "A cell has the mean ± the standard deviation over seeds, rounded to one \
+    or two digits of the latter; the best mean of a row is bold. With four or more seeds, the \
+    second line is the interquartile mean (IQM) with its 95 % interval by stratified bootstrap. \
+    The bounds of a method are this interval, or with fewer seeds the range over them. figures.csv \
+    has all of them unrounded. Only finished runs are included. † marks figures over runs with \
+    different program or package versions, or over runs that did not record them; see Provenance.";
 
 /// Explains the learning curves.
 const CURVES: &str = "Evaluations without exploration noise: mean over the seeds (n), and a band \
-    from the lowest seed to the highest. Triangles at the right edge mark the final results in \
-    the paper (Tables 3 and 4), which may be after a different number of steps.";
+    from the lowest seed to the highest.";
+/// Explains the marks of the paper's results.
+const CURVES_OF_PAPER: &str = "Triangles at the right edge mark the final results in the paper \
+    (Tables 3 and 4), which may be after a different number of steps.";
 /// Explains the steps to the thresholds.
 const EFFICIENCY: &str = "Environment steps until an evaluation's mean first reaches the \
     threshold: median over the seeds, with its 95 % interval by bootstrap (the range for fewer \
     than four seeds), and the number of finished seeds that reached it. A seed that never \
     reached it counts as infinite. The resolution is the interval between evaluations.";
 /// Explains return against smoothness.
-const PARETO: &str = "A point for each method, with bars for the bounds over the seeds (the \
-    interval with four or more seeds, else the range). The line connects the methods that no other \
-    beats in both directions.";
+const PARETO: &str = "A point for each method, with bars for its bounds. The line connects the \
+    methods that no other beats in both directions.";
 /// Explains the filmstrips.
 const FRAMES: &str = "One episode after training, without exploration noise, of the best method \
-    with a dmp policy and of DDPG, reset with the same seed, as in the paper's Figure 5.";
+    with a dmp policy and of DDPG, reset with the same seed.";
 /// Explains the joint trajectories.
 const JOINTS: &str = "One episode of each method's policy after training, without exploration \
-    noise, reset with the same seed. All panels have the same axes, as in the paper's Figures 6 \
-    and 7.";
+    noise, reset with the same seed. All panels of a picture have the same axes.";
 /// Explains the provenance.
 const PROVENANCE: &str = "Programs and packages that made the runs of each cell, by number, and \
     the seeds with a measured motion and with a recorded rollout.";
@@ -55,14 +56,16 @@ pub struct Section {
     pub id: String,
     /// Heading.
     pub title: String,
+    /// Conclusion from the table or figure, as a sentence.
+    pub finding: Option<String>,
     /// Paragraphs.
     pub about: Vec<String>,
     /// Table.
     pub grid: Option<Grid>,
     /// Plots.
     pub pictures: Vec<Picture>,
-    /// Frames of rollouts.
-    pub filmstrips: Vec<Filmstrip>,
+    /// Frames of rollouts, by task.
+    pub filmstrips: Vec<Vec<Filmstrip>>,
     /// Statements of the paper.
     pub statements: Vec<ClaimResult>,
     /// Name and text of files to quote.
@@ -80,96 +83,137 @@ impl Section {
     }
 }
 
-/// Returns the sections of a report, without empty ones.
-#[must_use]
-pub fn sections(report: &Report) -> Vec<Section> {
-    let mut sections = vec![overview(report)];
-    let of_kind = |kind: MeasureKind| {
-        let tables = report.tables.iter().filter(move |table| table.kind == kind);
-        tables.map(|table| of_table(report, table))
-    };
-    sections.extend(of_kind(MeasureKind::Result));
-    if !report.curves.is_empty() {
-        let mut curves = Section::new("Learning curves", &[CURVES]);
-        curves.pictures = report.curves.clone();
-        sections.push(curves);
-    }
-    if !report.efficiency.is_empty() {
-        sections.push(efficiency(report));
-    }
-    sections.extend(of_kind(MeasureKind::Smoothness));
-    if !report.pareto.is_empty() {
-        let mut pareto = Section::new("Return and smoothness", &[PARETO]);
-        pareto.pictures = report.pareto.clone();
-        sections.push(pareto);
-    }
-    if !report.filmstrips.is_empty() {
-        let mut frames = Section::new("Frames of a rollout", &[FRAMES]);
-        frames.filmstrips = report.filmstrips.clone();
-        sections.push(frames);
-    }
-    if !report.trajectories.is_empty() {
-        let mut joints = Section::new("Joints over a rollout", &[JOINTS]);
-        joints.pictures = report.trajectories.clone();
-        sections.push(joints);
-    }
-    sections.extend(of_kind(MeasureKind::Cost));
-    if !report.claims.results.is_empty() {
-        sections.push(statements(&report.claims));
-    }
-    if report.results.methods.iter().any(|method| method == paper::INTERPRETED_METHOD) {
-        sections.iter_mut().for_each(add_interpretation_note);
-    }
-    sections.push(provenance(&report.results));
-    sections
+/// The text of a report.
+pub struct Text {
+    /// Paragraphs at the top: the runs, and how to read the tables.
+    pub summary: Vec<String>,
+    /// The tables and figures of the paper, without empty ones.
+    pub main: Vec<Section>,
+    /// Everything else, which the pages show on request.
+    pub details: Vec<Section>,
 }
 
-/// Marks the column of the paper's method, and adds a footnote about its interpretation.
-fn add_interpretation_note(section: &mut Section) {
-    let has_figures =
-        section.grid.is_some() || !section.pictures.is_empty() || !section.statements.is_empty();
-    if !has_figures {
-        return;
+impl Text {
+    /// Writes the text of a report.
+    #[must_use]
+    pub fn of(report: &Report) -> Self {
+        let mut text =
+            Self { summary: summary(report), main: main(report), details: details(report) };
+        if report.results.methods.iter().any(|method| method == paper::INTERPRETED_METHOD) {
+            text.summary.push(paper::INTERPRETATION_NOTE.to_owned());
+            let sections = text.main.iter_mut().chain(&mut text.details);
+            let grids = sections.filter_map(|section| section.grid.as_mut());
+            let columns = grids.flat_map(|grid| &mut grid.columns);
+            for column in columns.filter(|column| *column == paper::INTERPRETED_METHOD) {
+                column.push_str(" ¹");
+            }
+        }
+        text
     }
-    let columns = section.grid.iter_mut().flat_map(|grid| &mut grid.columns);
-    for column in columns.filter(|column| *column == paper::INTERPRETED_METHOD) {
-        column.push_str(" ¹");
-    }
-    section.about.push(paper::INTERPRETATION_NOTE.to_owned());
 }
 
-fn provenance(results: &Results) -> Section {
-    let provenance = Provenance::of(results);
-    let mut section = Section::new("Provenance", &[PROVENANCE, &provenance.legend()]);
-    section.grid = Some(provenance.grid);
-    section
-}
-
-fn overview(report: &Report) -> Section {
-    let mut section = Section::new("What was run", &[]);
-    section.about.push(sentences(&report.results).join(" "));
+fn summary(report: &Report) -> Vec<String> {
+    let mut summary = vec![overview::summary(&report.results)];
     for subject in SUBJECTS {
         let named = report.results.methods.iter().any(|method| method == subject);
         if named && !report.claims.results.is_empty() {
             let counts = counts(&report.claims.results, subject).into_iter();
             let counts: Vec<_> =
                 counts.map(|(verdict, count)| format!("{count} {}", verdict.text())).collect();
-            section.about.push(format!(
+            summary.push(format!(
                 "The paper's {} statements, with {subject} as its DDPG-DMP: {}.",
                 report.claims.results.len(),
                 counts.join(", ")
             ));
         }
     }
-    section.grid = Some(runs_table(&report.results));
-    section.files = report.results.sweeps.clone();
-    section
+    summary.push(TABLES_NOTE.to_owned());
+    summary
+}
+
+fn main(report: &Report) -> Vec<Section> {
+    let results = &report.results;
+    // Other tasks have the same tables and figures, which then are not the paper's.
+    let cells = report.tables.iter().flat_map(|table| &table.rows).flat_map(|(_, cells)| cells);
+    let is_papers = cells.into_iter().any(|cell| cell.paper.is_some());
+    let title = |title: &str, place: &str| {
+        if is_papers { format!("{title} ({place})") } else { title.to_owned() }
+    };
+    let mut sections: Vec<Section> = Vec::new();
+    for table in report.tables.iter().filter(|table| table.measure.kind() == MeasureKind::Result) {
+        let mut section = of_table(report, table);
+        let place = if table.measure == Measure::Success { "Table 4" } else { "Table 3" };
+        section.title = title(&section.title, place);
+        sections.push(section);
+    }
+    if !report.curves.main.is_empty() {
+        let mut curves = Section::new(&title("Learning curves", "Figures 3 and 4"), &[CURVES]);
+        curves.finding = findings::first_to_threshold(&report.efficiency, &results.methods);
+        curves.about.extend(is_papers.then(|| CURVES_OF_PAPER.to_owned()));
+        curves.pictures = report.curves.main.clone();
+        sections.push(curves);
+    }
+    if !report.pareto.is_empty() {
+        let mut pareto = Section::new("Return and smoothness", &[PARETO]);
+        pareto.finding = findings::front(results);
+        pareto.pictures = report.pareto.clone();
+        sections.push(pareto);
+    }
+    if !report.filmstrips.is_empty() {
+        let mut frames = Section::new(&title("Frames of a rollout", "Figure 5"), &[FRAMES]);
+        frames.finding = findings::frames(results, &report.filmstrips);
+        let tasks = report.filmstrips.chunk_by(Filmstrip::is_of_same_task);
+        frames.filmstrips = tasks.map(<[_]>::to_vec).collect();
+        sections.push(frames);
+    }
+    if !report.trajectories.is_empty() {
+        let mut joints =
+            Section::new(&title("Joints over a rollout", "Figures 6 and 7"), &[JOINTS]);
+        joints.finding = findings::joints(results);
+        joints.pictures = report.trajectories.clone();
+        sections.push(joints);
+    }
+    sections
+}
+
+fn details(report: &Report) -> Vec<Section> {
+    let of_kind = |kind: MeasureKind| {
+        let tables = report.tables.iter().filter(move |table| table.measure.kind() == kind);
+        tables.map(|table| of_table(report, table))
+    };
+    let mut sections: Vec<Section> = of_kind(MeasureKind::Smoothness).collect();
+    if !report.efficiency.is_empty() {
+        sections.push(efficiency(report));
+    }
+    if !report.curves.others.is_empty() {
+        let mut curves = Section::new("Return of tasks with a success rate", &[CURVES]);
+        curves.pictures = report.curves.others.clone();
+        sections.push(curves);
+    }
+    sections.extend(of_kind(MeasureKind::Cost));
+    if !report.claims.results.is_empty() {
+        sections.push(statements(&report.claims));
+    }
+    sections.push(runs(&report.results));
+    sections.push(provenance(&report.results));
+    sections
 }
 
 fn of_table(report: &Report, table: &Table) -> Section {
     let mut section = Section::new(table.title, &[table.about]);
+    section.finding = findings::best(table, &report.results.methods);
+    let usual_seeds = table.usual_seeds();
+    if let Some(seeds) = &usual_seeds {
+        section.about[0].push_str(&format!(" Over {seeds} unless a cell says otherwise."));
+    }
     let rows = table.rows.iter().map(|(task, cells)| {
-        (task.clone(), cells.iter().map(|cell| cell.lines(table.digits)).collect())
+        let is_best = table.best(cells).into_iter();
+        let marks_best = table.measure.kind() != MeasureKind::Cost;
+        let cells = cells.iter().zip(is_best).map(|(cell, is_best)| GridCell {
+            lines: cell.lines(table.digits, usual_seeds.as_deref()),
+            is_best: is_best && marks_best,
+        });
+        GridRow { name: task.clone(), cells: cells.collect() }
     });
     section.grid = Some(Grid { columns: report.results.methods.clone(), rows: rows.collect() });
     section
@@ -182,11 +226,26 @@ fn efficiency(report: &Report) -> Section {
             format!("{task}: {threshold} ({source})")
         });
     section.about.push(format!("Thresholds: {}.", sources.collect::<Vec<_>>().join("; ")));
-    let rows = report.efficiency.iter().map(|row| {
-        let cells = row.cells.iter().map(EfficiencyCell::lines);
-        (format!("{}, {}", row.task, row.threshold), cells.collect())
+    let rows = report.efficiency.iter().map(|row| GridRow {
+        name: format!("{}, {}", row.task, row.threshold),
+        cells: row.cells.iter().map(|cell| cell.lines().into()).collect(),
     });
     section.grid = Some(Grid { columns: report.results.methods.clone(), rows: rows.collect() });
+    section
+}
+
+fn runs(results: &Results) -> Section {
+    let mut section = Section::new("What was run", &[]);
+    section.about = overview::omissions(results);
+    section.grid = Some(overview::runs_table(results));
+    section.files = results.sweeps.clone();
+    section
+}
+
+fn provenance(results: &Results) -> Section {
+    let provenance = Provenance::of(results);
+    let mut section = Section::new("Provenance", &[PROVENANCE, &provenance.legend()]);
+    section.grid = Some(provenance.grid);
     section
 }
 

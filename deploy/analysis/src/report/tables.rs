@@ -3,7 +3,7 @@
 use dmprl_run::format::grouped;
 use serde::Serialize;
 
-use super::measures::{Measure, MeasureKind};
+use super::measures::Measure;
 use super::paper::reported;
 use super::provenance::SoftwareCounts;
 use super::results::Results;
@@ -18,9 +18,9 @@ pub struct Table {
     pub about: &'static str,
     /// Number of decimals.
     pub digits: usize,
-    /// Group of the measure, which determines the table's position in the report.
+    /// The measure.
     #[serde(skip)]
-    pub kind: MeasureKind,
+    pub measure: Measure,
     /// Rows: a task and its cells in the order of the methods.
     pub rows: Vec<(String, Vec<Cell>)>,
 }
@@ -43,38 +43,86 @@ pub struct Cell {
 
 impl Cell {
     /// Returns the cell's lines of text.
+    ///
+    /// - `digits`: maximum number of decimals.
+    /// - `usual_seeds`: number of seeds that the text above the table mentions.
     #[must_use]
-    pub fn lines(&self, digits: usize) -> Vec<String> {
+    pub fn lines(&self, digits: usize, usual_seeds: Option<&str>) -> Vec<String> {
         let mut lines = Vec::new();
         match &self.summary {
             None if self.unknown > 0 => lines.push("not measured".to_owned()),
             None if self.unfinished > 0 => lines.push("not finished".to_owned()),
             None => lines.push("not run".to_owned()),
             // With one seed, the standard deviation is unknown, not zero.
-            Some(Summary { count: 1, mean, .. }) => {
-                lines.extend([number(*mean, digits), format!("1 seed{}", self.software.mark())]);
-            }
+            Some(Summary { count: 1, mean, .. }) => lines.push(number(*mean, digits)),
             Some(summary) => {
-                let Summary { count, mean, std, .. } = *summary;
-                let (point, bounds) = summary.point_and_bounds();
-                let [mean, std, point, low, high] =
-                    [mean, std, point, bounds[0], bounds[1]].map(|value| number(value, digits));
-                lines.push(format!("{mean} ± {std}"));
-                lines.push(match summary.interval {
-                    Some(_) => format!("IQM {point} [{low}, {high}]"),
-                    None => format!("range [{low}, {high}]"),
-                });
-                lines.push(format!("{count} seeds{}", self.software.mark()));
+                let decimals = decimals(summary.std, digits);
+                lines.push(mean_and_spread(summary.mean, summary.std, digits));
+                if let (Some(iqm), Some(interval)) = (summary.iqm, summary.interval) {
+                    let [iqm, low, high] =
+                        [iqm, interval[0], interval[1]].map(|value| number(value, decimals));
+                    lines.push(format!("{iqm} [{low}, {high}]"));
+                }
             }
         }
+        lines.extend(self.seeds().filter(|seeds| usual_seeds != Some(seeds)));
         if self.summary.is_some() && self.unknown > 0 {
             lines.push(format!("{} not measured", self.unknown));
         }
         if let Some((mean, std)) = self.paper {
+            // As printed.
             lines.push(format!("paper {mean:.digits$} ± {std:.digits$}"));
         }
         lines
     }
+
+    /// Returns the number of seeds as text, with a mark if they are of several programs.
+    fn seeds(&self) -> Option<String> {
+        let count = self.summary.as_ref()?.count;
+        let word = if count == 1 { "seed" } else { "seeds" };
+        Some(format!("{count} {word}{}", self.software.mark()))
+    }
+}
+
+impl Table {
+    /// Returns the most frequent number of seeds of a cell as text; `None` without any.
+    #[must_use]
+    pub fn usual_seeds(&self) -> Option<String> {
+        let all: Vec<String> =
+            self.rows.iter().flat_map(|(_, cells)| cells).filter_map(Cell::seeds).collect();
+        let frequency = |text: &String| all.iter().filter(|other| *other == text).count();
+        all.iter().max_by_key(|text| frequency(text)).cloned()
+    }
+
+    /// Returns for each cell of a row whether its mean is the best. No cell is the best if only one
+    /// has a mean, or if all means are equal.
+    #[must_use]
+    pub fn best(&self, cells: &[Cell]) -> Vec<bool> {
+        let sign = if self.measure.higher_is_better() { 1.0 } else { -1.0 };
+        let mean = |cell: &Cell| cell.summary.as_ref().map(|summary| sign * summary.mean);
+        let means = || cells.iter().filter_map(mean);
+        let best = means().fold(f64::NEG_INFINITY, f64::max);
+        let differs = means().any(|mean| mean < best);
+        cells.iter().map(|cell| differs && mean(cell) == Some(best)).collect()
+    }
+}
+
+/// Formats a mean and its standard deviation, rounded to one or two digits of the latter.
+fn mean_and_spread(mean: f64, std: f64, digits: usize) -> String {
+    let decimals = decimals(std, digits);
+    format!("{} ± {}", number(mean, decimals), number(std, decimals))
+}
+
+/// Returns the number of decimals, at most `digits`, so that a standard deviation has two
+/// significant digits if these are at most 35, otherwise one.
+fn decimals(std: f64, digits: usize) -> usize {
+    if std == 0.0 {
+        return digits;
+    }
+    let magnitude = std.abs().log10().floor();
+    let leading = std.abs() / 10_f64.powf(magnitude);
+    let significant = if leading < 3.55 { 2.0 } else { 1.0 };
+    (significant - 1.0 - magnitude).clamp(0.0, digits as f64) as usize
 }
 
 /// Formats a number; without decimals, with thousands separators.
@@ -120,7 +168,7 @@ fn table(results: &Results, measure: Measure) -> Table {
         title: measure.title(),
         about: measure.about(),
         digits: measure.digits(),
-        kind: measure.kind(),
+        measure,
         rows: rows.filter(has_measure).collect(),
     }
 }
@@ -131,7 +179,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cell_shows_the_range_below_four_seeds_and_marks_several_programs() {
+    fn cell_shows_an_interval_from_four_seeds_and_marks_several_programs() {
         let run = |seed| FixtureRun {
             task: "point-reach",
             method: "TD3",
@@ -140,28 +188,58 @@ mod tests {
             ended: true,
         };
         let runs: Vec<_> = (1..=4).map(run).collect();
-        let lines = |results: &Results| tables(results)[0].rows[0].1[0].lines(1);
+        let lines = |results: &Results| tables(results)[0].rows[0].1[0].lines(1, Some("7 seeds"));
         let mut three = fixture_results(&runs[..3]);
-        assert_eq!(lines(&three), ["-2.0 ± 1.0", "range [-3.0, -1.0]", "3 seeds"]);
+        assert_eq!(lines(&three), ["-2.0 ± 1.0", "3 seeds"]);
         three.runs[0].origin.programs = vec!["0.1.0 (commit 1234)".to_owned()];
-        assert_eq!(lines(&three)[2], "3 seeds †");
+        assert_eq!(lines(&three)[1], "3 seeds †");
         three.runs.iter_mut().for_each(|run| run.origin.programs = vec!["0.1.0".to_owned()]);
-        assert_eq!(lines(&three)[2], "3 seeds †", "the commits are unknown");
+        assert_eq!(lines(&three)[1], "3 seeds †", "the commits are unknown");
         let known = || "0.1.0 (commit 1234)".to_owned();
         three.runs.iter_mut().for_each(|run| run.origin.programs = vec![known()]);
         three.runs[0].origin.programs = vec![known(), known()];
         three.runs[0].origin.packages.push("Python 3.11.7".to_owned());
-        assert_eq!(lines(&three)[2], "3 seeds", "a run was resumed by the same program");
+        assert_eq!(lines(&three)[1], "3 seeds", "a run was resumed by the same program");
         let mut one = fixture_results(&runs[..1]);
         assert_eq!(lines(&one), ["-1.0", "1 seed"]);
         one.runs[0].origin.programs = vec![known(), "0.1.0 (commit 5678)".to_owned()];
         one.runs[0].origin.packages.push("Python 3.11.7".to_owned());
         assert_eq!(lines(&one), ["-1.0", "1 seed †"]);
         let four = fixture_results(&runs);
-        assert!(lines(&four)[1].starts_with("IQM -2.5 ["), "{:?}", lines(&four));
+        assert!(lines(&four)[1].starts_with("-2.5 ["), "{:?}", lines(&four));
         let mut packages = four;
         packages.runs[3].origin.packages = vec!["Python 3.12.1".to_owned()];
         assert_eq!(lines(&packages)[2], "4 seeds †");
+    }
+
+    #[test]
+    fn means_are_rounded_like_their_spread() {
+        let text = |mean, std| mean_and_spread(mean, std, 2);
+        assert_eq!(text(-4.063, 0.112), "-4.06 ± 0.11");
+        assert_eq!(text(-23.56, 4.45), "-24 ± 4");
+        assert_eq!(text(-5.53, 0.43), "-5.5 ± 0.4");
+        assert_eq!(text(-37.52, 2.69), "-37.5 ± 2.7");
+        assert_eq!(text(-103.55, 86.87), "-104 ± 87");
+        assert_eq!(text(1.0, 0.0), "1.00 ± 0.00");
+        assert_eq!(text(0.5, 0.004), "0.50 ± 0.00", "at most the measure's decimals");
+        assert_eq!(mean_and_spread(20_000.0, 1_234.0, 0), "20,000 ± 1,234");
+    }
+
+    #[test]
+    fn best_means_are_marked_where_methods_differ() {
+        let run = |method, value| FixtureRun {
+            task: "panda-reach",
+            method,
+            seed: 1,
+            rows: vec![value],
+            ended: true,
+        };
+        let results = fixture_results(&[run("TD3", 1.0), run("SAC", 0.5), run("NDP", 1.0)]);
+        let table = &tables(&results)[0];
+        assert_eq!(table.best(&table.rows[0].1), [true, false, true]);
+        assert_eq!(table.best(&table.rows[0].1[..1]), [false], "no other method");
+        assert_eq!(table.usual_seeds().as_deref(), Some("1 seed"));
+        assert_eq!(table.rows[0].1[0].lines(2, Some("1 seed")), ["1.00"]);
     }
 
     #[test]
@@ -178,7 +256,7 @@ mod tests {
         let table = |title: &str| tables.iter().find(|table| table.title == title).unwrap();
         let rows = |title: &str| {
             let rows = table(title).rows.iter().map(|(task, cells)| {
-                let first = cells.iter().map(|cell| cell.lines(2).swap_remove(0));
+                let first = cells.iter().map(|cell| cell.lines(2, None).swap_remove(0));
                 (task.as_str(), first.collect::<Vec<_>>())
             });
             rows.collect::<Vec<_>>()
