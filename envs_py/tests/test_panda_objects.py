@@ -154,6 +154,16 @@ class ObservationTest(unittest.TestCase):
                         np.testing.assert_allclose(row[at + 6 : at + 9], velocity[3:], atol=1e-9)
                         np.testing.assert_allclose(row[at + 9 : at + 12], velocity[:3], atol=1e-9)
 
+    def test_slide_observes_the_remaining_time(self):
+        env, out = started(IDS["PandaSlide"], env_count=2)
+        at = column(env, "remaining_time")
+        np.testing.assert_array_equal(out.next_observations[:, at], 1.0)
+        steps = env.task.episode_steps
+        for done in range(1, steps + 1):
+            env.step_segment(np.zeros(out.actions.shape), out)
+            np.testing.assert_allclose(out.observations[:, 1, at], 1.0 - done / steps, atol=1e-6)
+        np.testing.assert_array_equal(out.next_observations[:, at], 1.0, "a new episode")
+
     def test_euler_angles_are_rotations_about_fixed_axes(self):
         rng = np.random.default_rng(0)
         angles = rng.uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1], (200, 3))

@@ -214,7 +214,11 @@ class PandaPushJointsDense(PandaPushJoints):
 
 
 class PandaSlide(PandaObjects):
-    """Makes a puck slide to a goal out of the arm's reach, with the gripper closed."""
+    """Makes a puck slide to a goal out of the arm's reach, with the gripper closed.
+
+    The puck slides for up to the length of an episode. So where it is at the end depends on the
+    remaining time, which the observation has as its last entry, from 1 to 0.
+    """
 
     id = "dmprl/PandaSlide-v0"
     camera: ClassVar[Mapping[str, Any]] = {
@@ -227,6 +231,15 @@ class PandaSlide(PandaObjects):
         (puck(),), table_x=(-0.8, 0.6), has_edges=False, finger_friction=2.0 * PUCK_FRICTION
     )
     goal_range = ((0.25, -0.15, 0.0), (0.55, 0.15, 0.0))
+    recorded: tuple[str, ...] = (*PandaObjects.recorded, "time")
+
+    def observation_names(self) -> list[str]:  # noqa: D102 - inherited
+        return [*super().observation_names(), "remaining_time"]
+
+    def observe(self, fields: Fields, out: NDArray[np.float64]) -> None:  # noqa: D102 - inherited
+        super().observe(fields, out)
+        seconds = self.episode_steps * self.frame_skip * self.model.opt.timestep
+        out[..., -1] = 1.0 - fields["time"] / seconds
 
 
 class PandaSlideDense(PandaSlide):

@@ -312,8 +312,8 @@ def is_put(state: State, index: int, goal: NDArray[np.float64]) -> bool:
 def split(task: PandaObjects, row: NDArray[np.float64]) -> State:
     """Splits an observation of a task with displacements of the end effector."""
     count, width = len(task.scene.objects), task.scene.has_gripper
-    objects = row[-OBJECT_ENTRIES * count :].reshape(count, OBJECT_ENTRIES)
     hand = row[6 * count :]
+    objects = hand[8 if width else 6 :][: OBJECT_ENTRIES * count].reshape(count, OBJECT_ENTRIES)
     return State(
         hand=hand[:3],
         width=float(hand[6]) if width else 0.0,

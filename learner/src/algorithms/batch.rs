@@ -237,7 +237,7 @@ impl Batch {
         sample: &Sample<'_>,
         config: &AlgorithmConfig,
     ) {
-        let Sample { window, outcome, goal, hindsight } = sample;
+        let Sample { window, outcome, goal, .. } = sample;
         let discount = config.discount as f32;
         let (rewards_discount, factor, next) = match config.target {
             Target::NStep => (
@@ -251,21 +251,16 @@ impl Batch {
         let rows = row * o..(row + 1) * o;
         self.observations[rows.clone()].copy_from_slice(replay.observation(window));
         self.next_observations[rows.clone()].copy_from_slice(next);
-        self.rewards[row] = match goal {
-            None => replay.discounted_reward(window, rewards_discount),
-            Some(goal) => {
-                let Goal { rule, values } = *goal;
-                rule.set_desired(&mut self.observations[rows.clone()], values);
-                rule.set_desired(&mut self.next_observations[rows], values);
-                replay.discounted_goal_reward(window, outcome.steps, *goal, rewards_discount)
-            }
-        };
-        if let Some(hindsight) = hindsight {
-            let steps = outcome.steps;
-            self.rewards[row] +=
-                hindsight.discounted_bonus(replay, window, steps, rewards_discount);
+        if let Some(Goal { rule, values }) = *goal {
+            rule.set_desired(&mut self.observations[rows.clone()], values);
+            rule.set_desired(&mut self.next_observations[rows], values);
         }
+        self.rewards[row] = sample.discounted_reward(replay, rewards_discount);
         self.bootstrap[row] = if outcome.terminated { 0.0 } else { factor };
+        if let Some(reward) = sample.reward_after(replay, config) {
+            self.rewards[row] += factor * reward;
+            self.bootstrap[row] = 0.0;
+        }
         if let Some(shape) = shape.outcome {
             let own = row * shape.outputs()..(row + 1) * shape.outputs();
             shape.write_motion(replay, window, *outcome, &mut self.motion[own]);

@@ -1,6 +1,6 @@
 //! A sample of a batch: a window, with another goal if hindsight draws one.
 
-use dmprl_shared::config::{AlgorithmConfig, Target};
+use dmprl_shared::config::{AfterTimeLimit, AlgorithmConfig, Target};
 
 use crate::normaliser::Normaliser;
 use crate::replay::{Goal, GoalSampler, Outcome, Replay, Sampler, Window};
@@ -63,6 +63,37 @@ impl<'a> Sample<'a> {
 }
 
 impl Sample<'_> {
+    /// Returns the sum of discount^i r_i over the steps, with the bonus for motion.
+    pub(super) fn discounted_reward(&self, replay: &Replay, discount: f32) -> f32 {
+        let Self { window, outcome: Outcome { steps, .. }, goal, hindsight } = self;
+        let reward = match goal {
+            None => replay.discounted_reward(window, discount),
+            Some(goal) => replay.discounted_goal_reward(window, *steps, *goal, discount),
+        };
+        let bonus =
+            |sampler: &&GoalSampler| sampler.discounted_bonus(replay, window, *steps, discount);
+        reward + hindsight.as_ref().map_or(0.0, bonus)
+    }
+
+    /// Returns the return after the last step, if it is known: with `after_time_limit =
+    /// "last_reward"`, that of the last reward in every step for ever.
+    pub(super) fn reward_after(&self, replay: &Replay, config: &AlgorithmConfig) -> Option<f32> {
+        let Self { window, outcome, goal, .. } = self;
+        let is_last = outcome.steps == window.len() && !outcome.terminated;
+        let holds = config.after_time_limit == AfterTimeLimit::LastReward;
+        if !(holds && is_last && replay.ends_at_time_limit(window)) {
+            return None;
+        }
+        let reward = match goal {
+            None => replay.last_reward(window),
+            Some(Goal { rule, values }) => {
+                let last = replay.observation_after(window, outcome.steps);
+                rule.reward(rule.distance(rule.achieved(last), values))
+            }
+        };
+        Some(reward / (1.0 - config.discount as f32))
+    }
+
     /// Returns whether the window led to its goal, with all its steps.
     pub(super) fn led_to_goal(&self, replay: &Replay) -> bool {
         let Self { window, outcome, goal, hindsight } = self;
@@ -87,7 +118,7 @@ pub(super) fn target_range(hindsight: Option<&GoalSampler>, config: &AlgorithmCo
 #[cfg(test)]
 mod tests {
     use dmprl_shared::config::{Hindsight, Windows};
-    use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED};
+    use dmprl_shared::segment::{SegmentHeader, SegmentLayout, TERMINATED, TRUNCATED};
 
     use super::*;
     use crate::learner::tests::goal_rule;
@@ -112,5 +143,41 @@ mod tests {
             assert_eq!(demonstrated(1.0), 50);
             assert!(demonstrated(0.0) < 25);
         }
+    }
+
+    #[test]
+    fn last_reward_lasts_for_ever_after_the_time_limit_only() {
+        let layout = SegmentLayout { segment_steps: 1, observation_len: 2, action_len: 1 };
+        let mut replay = Replay::new(layout, 100, 1, 1);
+        for (episode, flags) in [(0, TERMINATED), (1, TRUNCATED)] {
+            for (episode_step, flags) in [(0, 0), (1, flags)] {
+                let header = SegmentHeader {
+                    episode,
+                    episode_step,
+                    steps_len: 1,
+                    flags,
+                    ..Default::default()
+                };
+                // The achieved goal goes from 1 to 3, the desired goal is 9.
+                replay.insert(&header, &[1.0, 9.0, 3.0, 9.0, 0.1, -1.0]);
+            }
+        }
+        let rule = goal_rule();
+        let after = |slot, values: Option<&[f32]>, after_time_limit| {
+            let window = replay.window(slot, 0).unwrap();
+            let outcome = Outcome { steps: 1, terminated: window.terminated };
+            let goal = values.map(|values| Goal { rule: &rule, values });
+            let config =
+                AlgorithmConfig { after_time_limit, discount: 0.75, ..AlgorithmConfig::default() };
+            Sample { window, outcome, goal, hindsight: None }.reward_after(&replay, &config)
+        };
+        let slots = |values, after_time_limit| {
+            [0, 1, 2, 3].map(|slot| after(slot, values, after_time_limit))
+        };
+        let unknown = [None; 4];
+        assert_eq!(slots(None, AfterTimeLimit::Bootstrap), unknown);
+        assert_eq!(slots(None, AfterTimeLimit::LastReward), [None, None, None, Some(-4.0)]);
+        let reached = slots(Some(&[3.0]), AfterTimeLimit::LastReward);
+        assert_eq!(reached, [None, None, None, Some(0.0)]);
     }
 }

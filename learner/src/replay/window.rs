@@ -148,6 +148,23 @@ impl Replay {
         second.iter().rev().chain(first.iter().rev()).fold(0.0, |sum, r| r + discount * sum)
     }
 
+    /// Returns the reward of the window's last step.
+    #[must_use]
+    pub fn last_reward(&self, window: &Window) -> f32 {
+        let (first, second) = self.parts(window, |(_, _, rewards)| rewards, 1);
+        second.last().or(first.last()).copied().unwrap_or(0.0)
+    }
+
+    /// Returns true if the episode reached its time limit at the window's last step.
+    #[must_use]
+    pub fn ends_at_time_limit(&self, window: &Window) -> bool {
+        let Window { slot, offset, first_len, second_len, next, .. } = *window;
+        let (last, end) =
+            if second_len > 0 { (next, second_len) } else { (slot, offset + first_len) };
+        let last = self.slots[last as usize];
+        last.truncated && last.steps_len == end
+    }
+
     /// Returns the window's rows of one part of the blocks, with `width` numbers per step, from the
     /// first and from the second slot.
     fn parts<'a>(
@@ -250,6 +267,20 @@ pub(super) mod tests {
         assert_eq!(replay.second_observation(&window), [203.0]);
         // 2 + 0.5 * 3 + 0.25 * 4
         assert_eq!(replay.discounted_reward(&window, 0.5), 4.5);
+    }
+
+    #[test]
+    fn the_window_that_ends_at_the_time_limit_is_known() {
+        let mut replay = Replay::new(LAYOUT, 300, 1, 1);
+        episode(&mut replay, 0, 8, TRUNCATED);
+        episode(&mut replay, 1, 9, TRUNCATED);
+        episode(&mut replay, 2, 6, TERMINATED);
+        let windows = (0..replay.len()).flat_map(|slot| (0..3).map(move |at| (slot, at)));
+        let windows = windows.filter_map(|(slot, offset)| replay.window(slot, offset));
+        let last = windows.filter(|window| replay.ends_at_time_limit(window));
+        let last: Vec<_> =
+            last.map(|it| (replay.observation(&it)[0], replay.last_reward(&it))).collect();
+        assert_eq!(last, [(5.0, 7.0), (106.0, 8.0)]);
     }
 
     #[test]

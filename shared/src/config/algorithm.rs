@@ -35,6 +35,17 @@ pub enum Target {
     Literal,
 }
 
+/// The return after an episode that reached its time limit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum AfterTimeLimit {
+    /// Q'(s_T, pi'(s_T)), as if the episode continued (Pardo et al. 2018, arXiv 1712.00378).
+    Bootstrap,
+    /// The last reward in every step for ever, r_T / (1 - discount), so that the state at the end
+    /// counts most.
+    LastReward,
+}
+
 /// The learning algorithm.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
@@ -47,6 +58,9 @@ pub struct AlgorithmConfig {
     pub windows: Windows,
     /// The critic's regression target.
     pub target: Target,
+    /// The return after an episode that reached its time limit. `last_reward` is for tasks where
+    /// only the end of an episode counts, and needs `target = "n_step"` (not with `ndp`).
+    pub after_time_limit: AfterTimeLimit,
     /// Discount per environment step.
     pub discount: f64,
     /// Target smoothing: target <- polyak * network + (1 - polyak) * target.
@@ -193,6 +207,7 @@ impl Default for AlgorithmConfig {
             critic: CriticInput::Segment,
             windows: Windows::Sliding,
             target: Target::NStep,
+            after_time_limit: AfterTimeLimit::Bootstrap,
             discount: 0.99,
             polyak: 5e-3,
             critic_learning_rate: 1e-3,

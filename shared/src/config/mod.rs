@@ -17,8 +17,8 @@ mod task;
 mod tasks;
 
 pub use algorithm::{
-    AlgorithmConfig, CriticInput, ExplorationConfig, ExplorationKind, LearningRateDecay, NdpConfig,
-    SacConfig, Target, Td3Config, TqcConfig, WarmUpKind, Windows,
+    AfterTimeLimit, AlgorithmConfig, CriticInput, ExplorationConfig, ExplorationKind,
+    LearningRateDecay, NdpConfig, SacConfig, Target, Td3Config, TqcConfig, WarmUpKind, Windows,
 };
 pub use dmprl_runtime::config::{
     AlgorithmName, BasisWidths, CanonicalIntegration, Controller, DmpConfig, ForcingScaling,

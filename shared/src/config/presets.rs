@@ -114,6 +114,7 @@ name = "ddpg"
 critic = "first"
 windows = "segment"
 target = "literal"
+after_time_limit = "bootstrap"
 discount = 0.99
 polyak = 0.005
 critic_learning_rate = 0.0003

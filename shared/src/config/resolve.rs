@@ -4,8 +4,8 @@ mod algorithms;
 
 use super::endpoint::{is_endpoint, is_plain};
 use super::{
-    AlgorithmName, ConfigError, CriticInput, DeliveryLevel, ExperimentConfig, PolicyKind,
-    RangeError, Start, WarmUpKind, Windows, check_hidden, range,
+    AfterTimeLimit, AlgorithmName, ConfigError, CriticInput, DeliveryLevel, ExperimentConfig,
+    PolicyKind, RangeError, Start, WarmUpKind, Windows, check_hidden, range,
 };
 
 /// Properties of the machine, passed in by the caller.
@@ -251,6 +251,12 @@ impl ExperimentConfig {
         let literal = self.algorithm.target == super::Target::Literal;
         range("algorithm.target", "literal", !(literal && sliding && several), || {
             "n_step, or algorithm.windows = \"segment\", which the literal target requires".into()
+        })?;
+        let holds = self.algorithm.after_time_limit == AfterTimeLimit::LastReward;
+        let on_policy = self.algorithm.name == AlgorithmName::Ndp;
+        let fits = !holds || !(literal || on_policy);
+        range("algorithm.after_time_limit", "last_reward", fits, || {
+            "bootstrap with algorithm.target = \"literal\" or algorithm.name = \"ndp\"".into()
         })?;
         let (dmp, kind) = (self.policy.kind == PolicyKind::Dmp, self.policy.kind.name());
         let draws_dmp_parameters = self.exploration.warm_up_kind == WarmUpKind::DmpParameters;

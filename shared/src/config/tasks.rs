@@ -128,7 +128,9 @@ const PANDA_SLIDE: TaskDefaults = TaskDefaults {
     name: "panda-slide",
     id: "dmprl/PandaSlide-v0",
     about: "Franka Panda makes a puck slide to a goal out of reach, sparse reward",
+    observation_len: 28,
     values: PANDA_SLIDE_VALUES,
+    over_presets: &[("goal", PANDA_GOAL), ("goal", SLIDE_GOAL)],
     ..PANDA_PUSH
 };
 
@@ -391,12 +393,11 @@ position_scale = 20.0
 "#;
 
 // An action of 1 moves the end effector by 0.05 m, as in PANDA_REACH_VALUES. At that speed the arm
-// strikes a cube more than it pushes it, and sends a puck too far
-// (docs/decisions/0104-action-range.md). With slower actions stacking takes too long. `--algo ndp`,
-// for which `position_scale` is, uses all of the range. These lines continue the last table of
-// PANDA_OBJECTS.
+// strikes a cube more than it pushes it, and sends a puck too far (docs/decisions/0104-action-range.md
+// and 0126). With slower actions stacking takes too long. `--algo ndp`, for which `position_scale`
+// is, uses all of the range. These lines continue the last table of PANDA_OBJECTS.
 const PUSH_RANGE: &str = "action_range = 0.4\n";
-const STRIKE_RANGE: &str = "action_range = 0.25\n";
+const STRIKE_RANGE: &str = "action_range = 0.5\n";
 const STACK_RANGE: &str = "action_range = 0.6\n";
 
 // Table 2 of the paper, column of the Panda tasks.
@@ -440,6 +441,10 @@ const PANDA_GOAL: &str = r#"
 [algorithm]
 discount = 0.95
 "#;
+
+// Continues PANDA_GOAL. A puck can pass the goal, so only the end of the episode counts
+// (docs/decisions/0126-return-after-the-time-limit.md).
+const SLIDE_GOAL: &str = "after_time_limit = \"last_reward\"\n";
 
 impl TaskDefaults {
     /// Returns the spec that the environment reports, without names of observations.
