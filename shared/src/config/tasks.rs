@@ -393,9 +393,9 @@ position_scale = 20.0
 "#;
 
 // An action of 1 moves the end effector by 0.05 m, as in PANDA_REACH_VALUES. At that speed the arm
-// strikes a cube more than it pushes it, and sends a puck too far (docs/decisions/0104-action-range.md
-// and 0126). With slower actions stacking takes too long. `--algo ndp`, for which `position_scale`
-// is, uses all of the range. These lines continue the last table of PANDA_OBJECTS.
+// strikes a cube more than it pushes it, and sends a puck too far (decisions 0104 and 0126). With
+// slower actions stacking takes too long. `--algo ndp`, for which `position_scale` is, uses all of
+// the range. These lines continue the last table of PANDA_OBJECTS.
 const PUSH_RANGE: &str = "action_range = 0.4\n";
 const STRIKE_RANGE: &str = "action_range = 0.5\n";
 const STACK_RANGE: &str = "action_range = 0.6\n";
