@@ -2,6 +2,7 @@
 
 import json
 import tempfile
+import tomllib
 import unittest
 from pathlib import Path
 
@@ -38,6 +39,20 @@ class ZooTest(unittest.TestCase):
             self.assertTrue((folder / f"policies/{row['policy_version']}.safetensors").is_file())
             for file in ("manifest.json", "config.toml"):
                 self.assertNotIn('"/', (folder / file).read_text(), f"a path in {name}/{file}")
+
+    def test_the_table_in_the_book_has_every_policy(self):
+        page = Path(__file__).resolve().parents[2] / "docs" / "zoo.md"
+        table = [line for line in page.read_text().splitlines() if line.startswith("| `")]
+        rows = []
+        for name in zoo.names():
+            folder = zoo.FOLDER / name
+            row = json.loads((folder / "evaluations.jsonl").read_text())
+            seed = tomllib.loads((folder / "config.toml").read_text())["run"]["seed"]
+            size = (folder / f"policies/{row['policy_version']}.safetensors").stat().st_size
+            success = "" if row["success_rate"] is None else f"{row['success_rate']:.2f}"
+            figures = f"{row['return_mean']:.2f} | {success} | {size / 1024:.0f} |"
+            rows.append(f"| `{name}` | {seed} | {row['env_steps']:,} | {figures}")
+        self.assertEqual(sorted(table), sorted(rows))
 
     def test_the_cube_is_brought_to_its_goal(self):
         policies = [dmprl.Policy.load("zoo:panda-pick-and-place") for _ in range(20)]

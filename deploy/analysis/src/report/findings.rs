@@ -101,8 +101,11 @@ fn is_apart(cells: &[Cell], is_best: &[bool]) -> bool {
         })
 }
 
-/// Names the methods that reach the threshold of each task first.
+/// Names the methods that reach the threshold of each task first, if there are several methods.
 pub fn first_to_threshold(rows: &[EfficiencyRow], methods: &[String]) -> Option<String> {
+    if methods.len() < 2 {
+        return None;
+    }
     let mut groups = Vec::new();
     for row in rows {
         let medians = row.cells.iter().filter_map(|cell| cell.median);
