@@ -24,6 +24,19 @@ pub fn has_colour(method: &str) -> bool {
     KNOWN.contains(&method)
 }
 
+/// Returns the colours of a picture's methods, which differ as long as there are enough of them.
+#[must_use]
+pub(crate) fn palette(methods: &[&str]) -> Vec<RGBColor> {
+    let known = |method: &&str| KNOWN.iter().position(|known| known == method);
+    let taken: Vec<usize> = methods.iter().filter_map(known).collect();
+    let mut free = (0..COLOURS.len()).filter(|index| !taken.contains(index)).chain(0..);
+    methods
+        .iter()
+        .map(|method| known(method).or_else(|| free.next()).unwrap_or(0))
+        .map(|index| COLOURS[index % COLOURS.len()])
+        .collect()
+}
+
 /// Returns the colour of a method.
 ///
 /// - `index`: index of the method in the report, which selects the colour if it has no fixed one.
@@ -31,4 +44,19 @@ pub fn has_colour(method: &str) -> bool {
 pub fn colour(index: usize, method: &str) -> RGBColor {
     let known = KNOWN.iter().position(|known| *known == method);
     COLOURS[known.unwrap_or(index) % COLOURS.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn methods_of_a_picture_have_different_colours() {
+        let colours = palette(&["A", "B", "TD3-DMP", "C", "DDPG-DMP"]);
+        assert_eq!((colours[2], colours[4]), (COLOURS[2], COLOURS[0]));
+        let distinct: std::collections::BTreeSet<_> =
+            colours.iter().map(|colour| (colour.0, colour.1, colour.2)).collect();
+        assert_eq!(distinct.len(), colours.len());
+        assert_eq!(palette(&["A"; 20]).len(), 20);
+    }
 }

@@ -8,6 +8,7 @@ mod scatter;
 mod small_multiples;
 
 pub(crate) use axes::{Axes, Chart};
+pub(crate) use colours::palette;
 pub use colours::{colour, has_colour};
 pub use learning_curve::learning_curve;
 pub(crate) use png::png;

@@ -29,10 +29,14 @@ pub(crate) struct Bounded {
 }
 
 /// The point of a method.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(crate) struct ScatterPoint {
+    /// Number of the method. A line connects the points of a method.
+    pub(crate) method: usize,
     /// Colour of the method.
     pub(crate) colour: RGBColor,
+    /// Text beside the point, if any.
+    pub(crate) label: String,
     /// Horizontal coordinate.
     pub(crate) x: Bounded,
     /// Vertical coordinate.
@@ -131,14 +135,25 @@ where
         panel.front.iter().copied(),
         BLACK.mix(0.35).stroke_width(2),
     ))?;
-    for ScatterPoint { colour, x, y } in &panel.points {
+    for (index, ScatterPoint { method, colour, label, x, y }) in panel.points.iter().enumerate() {
+        let place = (x.value, y.value);
+        let mut later = panel.points[index + 1..].iter();
+        if let Some(next) = later.find(|other| other.method == *method) {
+            let ends = vec![place, (next.x.value, next.y.value)];
+            chart.draw_series([PathElement::new(ends, colour.mix(0.5).stroke_width(1))])?;
+        }
         let bars = [
             x.bounds.map(|bound| (bound, y.value)).to_vec(),
             y.bounds.map(|bound| (x.value, bound)).to_vec(),
         ];
         let bars = bars.map(|ends| PathElement::new(ends, colour.mix(0.6).stroke_width(1)));
         chart.draw_series(bars)?;
-        chart.draw_series([Circle::new((x.value, y.value), 5, colour.filled())])?;
+        chart.draw_series([Circle::new(place, 5, colour.filled())])?;
+        if !label.is_empty() {
+            let style = ("sans-serif", 11).into_font().color(&INK);
+            let text = Text::new(label.clone(), (7, -6), style);
+            chart.draw_series([EmptyElement::at(place) + text])?;
+        }
     }
     Ok(())
 }

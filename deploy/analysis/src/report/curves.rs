@@ -12,7 +12,7 @@ use super::provenance::SoftwareCounts;
 use super::results::Results;
 use super::run::Run;
 use super::statistics::range;
-use crate::plots::{Axes, Chart, colour};
+use crate::plots::{Axes, Chart};
 
 /// Size of the plot with its axes, in pixels.
 const SIZE: (u32, u32) = (760, 520);
@@ -133,7 +133,7 @@ impl MethodLine {
         let software = SoftwareCounts::of(runs.iter().copied());
         Self {
             label: format!("{method} · n = {}{}", runs.len(), software.mark()),
-            colour: colour(index, method),
+            colour: results.colours()[index],
             points: points(&runs, measure),
             paper: paper.map(|(mean, _)| mean),
         }

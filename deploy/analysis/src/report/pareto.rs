@@ -3,12 +3,13 @@
 use anyhow::anyhow;
 use dmprl_run::safe_name;
 
+use super::families;
 use super::layout::Picture;
 use super::measures::{Measure, MeasureKind};
 use super::results::Results;
 use super::run::Run;
 use super::statistics::Summary;
-use crate::plots::{Bounded, Scatter, ScatterPanel, ScatterPoint, colour};
+use crate::plots::{Bounded, Scatter, ScatterPanel, ScatterPoint, palette};
 
 /// Draws a picture for each task with at least two methods of known smoothness. Its panels have the
 /// success rate on the vertical axis if the task reports it, else the return.
@@ -29,11 +30,12 @@ pub fn pareto(results: &Results) -> anyhow::Result<Vec<Picture>> {
             continue;
         }
         let title = format!("{task}: {} and smoothness", vertical.title().to_lowercase());
-        let names = results.methods.iter().enumerate();
+        let names = families::names(&results.methods);
+        let colours = palette(&names);
         let scatter = Scatter {
             title: &title,
             y_label: vertical.title(),
-            legend: names.map(|(index, name)| (name.as_str(), colour(index, name))).collect(),
+            legend: names.into_iter().zip(colours).collect(),
             panels,
         };
         let svg =
@@ -94,10 +96,13 @@ fn front_of(points: &[MethodPoint], measure: Measure) -> Vec<(f64, f64)> {
 /// Returns the panel of a measure.
 fn panel(results: &Results, task: &str, measure: Measure, vertical: Measure) -> ScatterPanel {
     let points = points(results, task, measure, vertical);
-    let drawn = points.iter().map(|&MethodPoint { method_index, x, y }| ScatterPoint {
-        colour: colour(method_index, &results.methods[method_index]),
-        x,
-        y,
+    let names = families::names(&results.methods);
+    let colours = palette(&names);
+    let drawn = points.iter().map(|&MethodPoint { method_index, x, y }| {
+        let (name, values) = families::split(&results.methods[method_index]);
+        let method = names.iter().position(|other| *other == name).unwrap_or(0);
+        let values: Vec<_> = values.into_iter().map(|(_, value)| value).collect();
+        ScatterPoint { method, colour: colours[method], label: values.join(", "), x, y }
     });
     ScatterPanel {
         x_label: measure.title().trim_start_matches("Smoothness: ").to_owned(),
@@ -141,6 +146,30 @@ mod tests {
         assert_eq!(front(points.clone(), false), [(1.0, 1.0), (2.0, 4.0), (3.0, 5.0)]);
         assert_eq!(front(points, true), [(4.0, 5.0)]);
         assert_eq!(front(vec![(-2.0, 3.0), (-1.0, 1.0)], true), [(-2.0, 3.0), (-1.0, 1.0)]);
+    }
+
+    #[test]
+    fn methods_of_a_grid_share_a_colour_and_show_their_values() {
+        let run = |method, reward| FixtureRun {
+            task: "pusher-v0",
+            method,
+            seed: 1,
+            rows: vec![reward],
+            ended: true,
+        };
+        let results = fixture_results(&[
+            run("TD3, algorithm.action_rate_penalty=0.25", -40.0),
+            run("SAC, algorithm.action_rate_penalty=0.25", -45.0),
+            run("TD3, algorithm.action_rate_penalty=0.75", -30.0),
+        ]);
+        let panel = panel(&results, "pusher-v0", Measure::ActionChange, Measure::Return);
+        let labels: Vec<_> = panel.points.iter().map(|point| point.label.as_str()).collect();
+        assert_eq!(labels, ["0.25", "0.25", "0.75"]);
+        let of_method = |index: usize| (panel.points[index].method, panel.points[index].colour);
+        assert_eq!(of_method(0), of_method(2));
+        assert!(of_method(0).0 != of_method(1).0 && of_method(0).1 != of_method(1).1);
+        let svg = &pareto(&results).unwrap()[0].svg;
+        assert_eq!((svg.matches("TD3").count(), svg.matches("0.75").count()), (1, 1));
     }
 
     #[test]

@@ -1,7 +1,10 @@
 //! The runs that a report compares.
 
+use plotters::style::RGBColor;
+
 use super::motion_metrics::Rollout;
 use super::run::{Run, RunKey};
+use crate::plots::palette;
 
 /// The runs of a report. Tasks and methods are in the order of the command line.
 #[derive(Debug, Clone, Default)]
@@ -38,6 +41,11 @@ impl Results {
         method: &'a str,
     ) -> impl Iterator<Item = &'a Run> + Clone {
         self.runs.iter().filter(move |run| run.task == task && run.method == method)
+    }
+
+    /// Returns the colours of the methods.
+    pub(super) fn colours(&self) -> Vec<RGBColor> {
+        palette(&self.methods.iter().map(String::as_str).collect::<Vec<_>>())
     }
 
     /// Returns the rollout of each method's lowest seed that has one. All have the same episode and

@@ -15,7 +15,7 @@ use super::statements::{
     ClaimResult, EPISODES_MIN, Limits, PaperClaims, SEEDS_MIN, SUBJECTS, counts,
 };
 use super::tables::Table;
-use super::{findings, overview, paper};
+use super::{families, findings, overview, paper};
 
 /// Explains the tables.
 const TABLES_NOTE: &str = "A cell has the mean ± the standard deviation over seeds, rounded to one \
@@ -156,6 +156,13 @@ fn main(report: &Report) -> Vec<Section> {
     if !report.pareto.is_empty() {
         let mut pareto = Section::new("Return and smoothness", &[PARETO]);
         pareto.finding = findings::front(results);
+        let keys = families::keys(&results.methods);
+        if !keys.is_empty() {
+            pareto.about.push(format!(
+                "The numbers beside the points are values of {}; a thin line connects them.",
+                keys.join(", ")
+            ));
+        }
         pareto.pictures = report.pareto.clone();
         sections.push(pareto);
     }

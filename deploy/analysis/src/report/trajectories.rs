@@ -2,12 +2,13 @@
 
 use anyhow::anyhow;
 use dmprl_run::safe_name;
+use plotters::style::RGBColor;
 
 use super::layout::Picture;
 use super::motion_metrics::Rollout;
 use super::results::{Results, ShownRollout};
 use super::run::Run;
-use crate::plots::{Panel, SmallMultiples, colour};
+use crate::plots::{Panel, SmallMultiples};
 
 /// Draws joint positions and velocities for each task whose joints are known. The pictures of a
 /// task show the same episode for every method.
@@ -15,7 +16,7 @@ use crate::plots::{Panel, SmallMultiples, colour};
 /// # Errors
 /// A picture cannot be drawn.
 pub fn trajectories(results: &Results) -> anyhow::Result<Vec<Picture>> {
-    let mut pictures = Vec::new();
+    let (mut pictures, colours) = (Vec::new(), results.colours());
     for task in &results.tasks {
         let shown = results.shown_rollouts(task);
         let Some(first) = shown.first().map(|shown| shown.rollout) else { continue };
@@ -24,7 +25,7 @@ pub fn trajectories(results: &Results) -> anyhow::Result<Vec<Picture>> {
             ("position", unit.clone(), positions as fn(&Rollout) -> &[Vec<f64>]),
             ("velocity", format!("{unit}/s"), velocities),
         ] {
-            let panels = shown.iter().map(|shown| panel(shown, rows));
+            let panels = shown.iter().map(|shown| panel(shown, &colours, rows));
             let title = format!("{task}: joint {what}, episode of seed {}", first.seed);
             let time = if first.control_dt_s > 0.0 { "time [s]" } else { "steps" };
             let drawn = SmallMultiples {
@@ -74,7 +75,11 @@ fn velocities(rollout: &Rollout) -> &[Vec<f64>] {
     &rollout.velocities
 }
 
-fn panel(shown: &ShownRollout<'_>, rows: fn(&Rollout) -> &[Vec<f64>]) -> Panel {
+fn panel(
+    shown: &ShownRollout<'_>,
+    colours: &[RGBColor],
+    rows: fn(&Rollout) -> &[Vec<f64>],
+) -> Panel {
     let ShownRollout { method_index, run, rollout } = shown;
     let (times, rows) = (rollout.times(), rows(rollout));
     let line = |joint: usize| -> Vec<(f64, f64)> {
@@ -82,7 +87,7 @@ fn panel(shown: &ShownRollout<'_>, rows: fn(&Rollout) -> &[Vec<f64>]) -> Panel {
     };
     Panel {
         title: format!("{}, seed {}", run.method, run.seed),
-        colour: colour(*method_index, &run.method),
+        colour: colours[*method_index],
         lines: (0..rollout.joints.len()).map(line).collect(),
     }
 }
