@@ -254,9 +254,11 @@ impl ExperimentConfig {
         })?;
         let holds = self.algorithm.after_time_limit == AfterTimeLimit::LastReward;
         let on_policy = self.algorithm.name == AlgorithmName::Ndp;
-        let fits = !holds || !(literal || on_policy);
+        let fits = !holds || !(literal || on_policy || self.algorithm.discount == 1.0);
         range("algorithm.after_time_limit", "last_reward", fits, || {
-            "bootstrap with algorithm.target = \"literal\" or algorithm.name = \"ndp\"".into()
+            "bootstrap with algorithm.target = \"literal\", algorithm.discount = 1 or \
+             algorithm.name = \"ndp\""
+                .into()
         })?;
         let (dmp, kind) = (self.policy.kind == PolicyKind::Dmp, self.policy.kind.name());
         let draws_dmp_parameters = self.exploration.warm_up_kind == WarmUpKind::DmpParameters;
@@ -333,6 +335,18 @@ mod tests {
     fn only_a_primitive_needs_integration_steps_that_fit() {
         let of = |kind| resolved(&[("policy.segment_steps", "7"), ("policy.kind", kind)]);
         assert!(of("dmp").is_err() && of("chunk").is_ok());
+    }
+
+    #[test]
+    fn last_reward_needs_a_discount_and_n_step_targets() {
+        let of = |more| resolved(&[("algorithm.after_time_limit", "last_reward"), more]);
+        assert!(of(("algorithm.discount", "0.95")).is_ok());
+        let segment = [("algorithm.windows", "segment"), ("algorithm.target", "literal")];
+        let last = ("algorithm.after_time_limit", "last_reward");
+        for keys in [vec![last, segment[0], segment[1]], vec![last, ("algorithm.discount", "1")]] {
+            let error = resolved(&keys).unwrap_err().to_string();
+            assert!(error.contains("algorithm.after_time_limit"), "{error}");
+        }
     }
 
     #[test]
