@@ -41,8 +41,8 @@ pub enum Target {
 pub enum AfterTimeLimit {
     /// Q'(s_T, pi'(s_T)), as if the episode continued (Pardo et al. 2018, arXiv 1712.00378).
     Bootstrap,
-    /// The last reward in every step for ever, r_T / (1 - discount), so that the state at the end
-    /// counts most.
+    /// r_T / (1 - discount), the return of the last reward in every further step, so that the end
+    /// of an episode counts most.
     LastReward,
 }
 
@@ -59,7 +59,8 @@ pub struct AlgorithmConfig {
     /// The critic's regression target.
     pub target: Target,
     /// The return after an episode that reached its time limit. `last_reward` is for tasks where
-    /// only the end of an episode counts, and needs `target = "n_step"` (not with `ndp`).
+    /// only the end of an episode counts. It needs `target = "n_step"` and a discount below 1 (not
+    /// with `ndp`).
     pub after_time_limit: AfterTimeLimit,
     /// Discount per environment step.
     pub discount: f64,

@@ -18,17 +18,21 @@ const COLOURS: [RGBColor; 8] = [
 const KNOWN: [&str; 8] =
     ["DDPG-DMP", "DDPG-DMP (paper)", "TD3-DMP", "SAC-DMP", "DDPG", "TD3", "SAC", "NDP"];
 
+/// Returns the index of a method's fixed colour, if it has one.
+fn known(method: &str) -> Option<usize> {
+    KNOWN.iter().position(|known| *known == method)
+}
+
 /// Returns true if a method has a fixed colour.
 #[must_use]
 pub fn has_colour(method: &str) -> bool {
-    KNOWN.contains(&method)
+    known(method).is_some()
 }
 
 /// Returns the colours of a picture's methods, which differ as long as there are enough of them.
 #[must_use]
 pub(crate) fn palette(methods: &[&str]) -> Vec<RGBColor> {
-    let known = |method: &&str| KNOWN.iter().position(|known| known == method);
-    let taken: Vec<usize> = methods.iter().filter_map(known).collect();
+    let taken: Vec<usize> = methods.iter().filter_map(|method| known(method)).collect();
     let mut free = (0..COLOURS.len()).filter(|index| !taken.contains(index)).chain(0..);
     methods
         .iter()
@@ -42,8 +46,7 @@ pub(crate) fn palette(methods: &[&str]) -> Vec<RGBColor> {
 /// - `index`: index of the method in the report, which selects the colour if it has no fixed one.
 #[must_use]
 pub fn colour(index: usize, method: &str) -> RGBColor {
-    let known = KNOWN.iter().position(|known| *known == method);
-    COLOURS[known.unwrap_or(index) % COLOURS.len()]
+    COLOURS[known(method).unwrap_or(index) % COLOURS.len()]
 }
 
 #[cfg(test)]

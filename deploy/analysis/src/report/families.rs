@@ -1,37 +1,31 @@
 //! Groups the methods of a sweep's grid: their labels differ in `key=value` pairs at the end.
 
+use super::layout::distinct;
+
 /// Splits the label of a method, such as `TD3-DMP, exploration.std=0.2`, into the method's name and
 /// the keys with their values.
 pub(super) fn split(label: &str) -> (&str, Vec<(&str, &str)>) {
-    let (mut name, mut values) = (label, Vec::new());
-    while let Some((before, last)) = name.rsplit_once(", ") {
-        let Some(pair) = last.split_once('=') else { break };
-        values.insert(0, pair);
-        name = before;
-    }
-    (name, values)
+    let starts = label.match_indices(", ").map(|(at, _)| at);
+    let starts: Vec<usize> = starts.filter(|at| pair(&label[at + 2..]).is_some()).collect();
+    let ends = starts.iter().skip(1).copied().chain([label.len()]);
+    let pairs = starts.iter().zip(ends).filter_map(|(at, end)| pair(&label[at + 2..end]));
+    (&label[..starts.first().copied().unwrap_or(label.len())], pairs.collect())
+}
+
+/// Splits `key=value`. The value may be a list, and so contain commas.
+fn pair(text: &str) -> Option<(&str, &str)> {
+    let is_of_key = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
+    text.split_once('=').filter(|(key, _)| !key.is_empty() && key.chars().all(is_of_key))
 }
 
 /// Returns the names of the methods, each once, in order.
 pub(super) fn names(labels: &[String]) -> Vec<&str> {
-    let mut names: Vec<&str> = Vec::new();
-    for name in labels.iter().map(|label| split(label).0) {
-        if !names.contains(&name) {
-            names.push(name);
-        }
-    }
-    names
+    distinct(labels.iter().map(|label| split(label).0))
 }
 
 /// Returns the keys of the grid, each once, in order.
 pub(super) fn keys(labels: &[String]) -> Vec<&str> {
-    let mut keys: Vec<&str> = Vec::new();
-    for (key, _) in labels.iter().flat_map(|label| split(label).1) {
-        if !keys.contains(&key) {
-            keys.push(key);
-        }
-    }
-    keys
+    distinct(labels.iter().flat_map(|label| split(label).1).map(|(key, _)| key))
 }
 
 #[cfg(test)]
@@ -45,6 +39,10 @@ mod tests {
         assert_eq!(
             split("DMP, last action, algorithm.discount=0.9, run.steps=5"),
             ("DMP, last action", vec![("algorithm.discount", "0.9"), ("run.steps", "5")])
+        );
+        assert_eq!(
+            split("TD3, policy.hidden=[64, 64], run.steps=5"),
+            ("TD3", vec![("policy.hidden", "[64, 64]"), ("run.steps", "5")])
         );
     }
 

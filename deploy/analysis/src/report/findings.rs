@@ -54,7 +54,7 @@ fn listed(words: &[String]) -> String {
 }
 
 /// Names the methods with the best mean of each task, and the tasks where the bounds of the best
-/// are apart from all others. Returns `None` for a measure of cost.
+/// overlap with no other's. Returns `None` for a measure of cost.
 pub fn best(table: &Table, methods: &[String]) -> Option<String> {
     let start = match table.measure.kind() {
         MeasureKind::Result => "Highest mean",
@@ -77,11 +77,10 @@ pub fn best(table: &Table, methods: &[String]) -> Option<String> {
     let text = sentence(start, &groups)?;
     Some(match apart.as_slice() {
         [] if !has_bounds => text,
-        [] => format!("{text} Nowhere are the bounds of the best apart from those of all others."),
-        tasks => format!(
-            "{text} The bounds of the best are apart from those of all others on {}.",
-            listed(tasks)
-        ),
+        [] => format!("{text} Everywhere the bounds of the best overlap with another's."),
+        tasks => {
+            format!("{text} The bounds of the best overlap with no other's on {}.", listed(tasks))
+        }
     })
 }
 
@@ -117,7 +116,7 @@ pub fn first_to_threshold(rows: &[EfficiencyRow], methods: &[String]) -> Option<
     sentence("First to the threshold, by the median over seeds", &groups)
 }
 
-/// Names the methods that no other beats in both, result and smoothness.
+/// Names the methods that no other beats in both result and smoothness.
 pub fn front(results: &Results) -> Option<String> {
     let mut groups = Vec::new();
     for task in &results.tasks {
@@ -127,7 +126,7 @@ pub fn front(results: &Results) -> Option<String> {
             add(&mut groups, names, task.clone());
         }
     }
-    sentence("No other method is better in both, result and mean change of actions", &groups)
+    sentence("No other method beats these in both result and mean change of actions", &groups)
 }
 
 /// States the last evaluations of the policies that the filmstrips show.
@@ -154,14 +153,14 @@ pub fn joints(results: &Results) -> Option<String> {
     let mut groups = Vec::new();
     for task in &results.tasks {
         let shown = results.shown_rollouts(task);
-        let jerks = shown.iter().filter_map(|shown| {
-            let jerk = shown.run.motion.as_ref()?.joint_jerk?;
-            Some((jerk, shown.method_index, &shown.rollout.unit))
-        });
-        let lowest = jerks.min_by(|a, b| a.0.total_cmp(&b.0));
-        if let (Some((jerk, method, unit)), true) = (lowest, shown.len() > 1) {
-            let task = format!("{task} ({jerk:.0} {unit}/s³)");
-            add(&mut groups, named(&results.methods, |index| index == method), task);
+        let mut jerks: Vec<_> = shown
+            .iter()
+            .filter_map(|shown| Some((shown.run.motion.as_ref()?.joint_jerk?, shown)))
+            .collect();
+        jerks.sort_by(|a, b| a.0.total_cmp(&b.0));
+        if let [(jerk, lowest), _, ..] = jerks.as_slice() {
+            let task = format!("{task} ({jerk:.0} {}/s³)", lowest.rollout.unit);
+            add(&mut groups, named(&results.methods, |index| index == lowest.method_index), task);
         }
     }
     sentence("Lowest joint jerk of the shown runs", &groups)
@@ -200,8 +199,8 @@ mod tests {
         let of = |results: &Results| best(&tables(results)[0], &results.methods);
         assert_eq!(
             of(&results).unwrap(),
-            "Highest mean: SAC on reacher-v1 and pusher-v0. The bounds of the best are apart from \
-             those of all others on reacher-v1."
+            "Highest mean: SAC on reacher-v1 and pusher-v0. The bounds of the best overlap with no \
+             other's on reacher-v1."
         );
         let mut one_seed = results.clone();
         one_seed.runs.retain(|run| run.seed == 1);
@@ -239,7 +238,7 @@ mod tests {
         );
         assert_eq!(
             front(&results).unwrap(),
-            "No other method is better in both, result and mean change of actions: SAC on \
+            "No other method beats these in both result and mean change of actions: SAC on \
              reacher-v1 and pusher-v0."
         );
         let filmstrip = Filmstrip {

@@ -4,6 +4,17 @@ use serde::Serialize;
 
 use super::results::Results;
 
+/// Returns the distinct values in order.
+pub(super) fn distinct<T: PartialEq>(values: impl IntoIterator<Item = T>) -> Vec<T> {
+    let mut known = Vec::new();
+    for value in values {
+        if !known.contains(&value) {
+            known.push(value);
+        }
+    }
+    known
+}
+
 /// A picture.
 #[derive(Debug, Clone, Serialize)]
 pub struct Picture {

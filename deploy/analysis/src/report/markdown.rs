@@ -46,7 +46,13 @@ fn section_text(section: &Section) -> String {
     if !section.statements.is_empty() {
         text.push_str(&statements_text(&section.statements));
     }
-    text.push_str(&pictures_text(&section.pictures));
+    if section.has_pairs {
+        text.push_str(&pairs_text(&section.pictures));
+    } else {
+        for Picture { alt, path, .. } in &section.pictures {
+            text.push_str(&format!("\n![{alt}]({path}.svg)\n"));
+        }
+    }
     for filmstrips in &section.filmstrips {
         text.push('\n');
         for filmstrip in filmstrips {
@@ -60,10 +66,9 @@ fn section_text(section: &Section) -> String {
     text
 }
 
-/// Shows pictures in pairs. Markdown has no width of pictures, so this is HTML.
-fn pictures_text(pictures: &[Picture]) -> String {
-    let picture = |picture: &Picture| {
-        let Picture { path, alt, .. } = picture;
+/// Shows two pictures in each row. Markdown has no width of pictures, so this is HTML.
+fn pairs_text(pictures: &[Picture]) -> String {
+    let picture = |Picture { path, alt, .. }: &Picture| {
         format!("<img src=\"{path}.svg\" alt=\"{alt}\" width=\"49%\">")
     };
     let pairs = pictures.chunks(2).map(|pair| {
@@ -82,15 +87,10 @@ fn grid_text(grid: &Grid) -> String {
     text.push_str(&cells(vec!["|---".to_owned(); grid.columns.len() + 1]));
     for GridRow { name, cells: row } in &grid.rows {
         let row = row.iter().map(|GridCell { lines, is_best }| {
-            let lines: Vec<_> = lines
-                .iter()
-                .enumerate()
-                .map(
-                    |(index, line)| {
-                        if *is_best && index == 0 { format!("**{line}**") } else { line.clone() }
-                    },
-                )
-                .collect();
+            let mut lines = lines.clone();
+            if let (true, Some(first)) = (is_best, lines.first_mut()) {
+                *first = format!("**{first}**");
+            }
             cell(&lines.join("<br>"))
         });
         text.push_str(&cells(std::iter::once(cell(name)).chain(row).collect()));

@@ -9,7 +9,8 @@
 //! - Measures: `measures` and `thresholds` compute the figures of a run, `statistics` summarises
 //!   them over seeds, `provenance` counts the program versions behind them.
 //! - Comparison: `tables`, `efficiency`, `curves`, `pareto`, `trajectories`, `filmstrips` and
-//!   `statements` compare methods, with the elements of `layout`. `families` groups a grid's.
+//!   `statements` compare methods, with the elements of `layout`. `families` groups the methods of
+//!   a grid.
 //! - Output: `contents` combines the parts, `findings` states a conclusion of each, `sections`
 //!   orders them for `page` and `markdown`.
 //!   `csv_files` and `snapshot` write the data for other programs and later reports.

@@ -3,7 +3,7 @@
 
 use dmprl_run::format::grouped;
 
-use super::layout::Grid;
+use super::layout::{Grid, distinct};
 use super::results::Results;
 use super::run::Run;
 
@@ -32,8 +32,8 @@ pub fn summary(results: &Results) -> String {
         };
         runs.push_str(&format!(" Started {span}."));
     }
-    let machines = results.runs.iter().map(|run| run.origin.machine.clone());
-    format!("{runs} Trained on {}.", distinct(machines))
+    let machines = distinct(results.runs.iter().map(|run| run.origin.machine.as_str()));
+    format!("{runs} Trained on {}.", machines.join("; "))
 }
 
 /// Returns sentences about motions that were not measured and pictures that were not drawn.
@@ -51,17 +51,6 @@ pub fn omissions(results: &Results) -> Vec<String> {
         sentences.push(format!("Not drawn: {}.", results.undrawn.join("; ")));
     }
     sentences
-}
-
-/// Joins the distinct values with "; ", in order.
-fn distinct(values: impl Iterator<Item = String>) -> String {
-    let mut known: Vec<String> = Vec::new();
-    for value in values {
-        if !known.contains(&value) {
-            known.push(value);
-        }
-    }
-    known.join("; ")
 }
 
 /// Returns a table of seeds and steps by task and method.

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 use serde::Serialize;
 
-use super::layout::Grid;
+use super::layout::{Grid, distinct};
 use super::results::Results;
 use super::run::{Origin, Run};
 
@@ -52,24 +52,17 @@ pub struct Provenance {
 
 /// Describes the programs and packages of a run.
 fn source(run: &Run) -> String {
-    let programs = distinct(&run.origin.programs);
+    let joined = |texts: &[String]| {
+        let texts = distinct(texts.iter().map(String::as_str));
+        texts.join("; then ")
+    };
+    let programs = joined(&run.origin.programs);
     let packages = if run.origin.packages.is_empty() {
         "package versions not recorded".to_owned()
     } else {
-        distinct(&run.origin.packages)
+        joined(&run.origin.packages)
     };
     format!("dmprl {programs}; {packages}")
-}
-
-/// Joins the distinct texts with "; then ", in order.
-fn distinct(texts: &[String]) -> String {
-    let mut known: Vec<&str> = Vec::new();
-    for text in texts {
-        if !known.contains(&text.as_str()) {
-            known.push(text);
-        }
-    }
-    known.join("; then ")
 }
 
 impl Provenance {

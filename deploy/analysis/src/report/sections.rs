@@ -64,6 +64,8 @@ pub struct Section {
     pub grid: Option<Grid>,
     /// Plots.
     pub pictures: Vec<Picture>,
+    /// True if two plots fit beside each other.
+    pub has_pairs: bool,
     /// Frames of rollouts, by task.
     pub filmstrips: Vec<Vec<Filmstrip>>,
     /// Statements of the paper.
@@ -114,18 +116,21 @@ impl Text {
 
 fn summary(report: &Report) -> Vec<String> {
     let mut summary = vec![overview::summary(&report.results)];
-    for subject in SUBJECTS {
-        let named = report.results.methods.iter().any(|method| method == subject);
-        if named && !report.claims.results.is_empty() {
-            let counts = counts(&report.claims.results, subject).into_iter();
-            let counts: Vec<_> =
-                counts.map(|(verdict, count)| format!("{count} {}", verdict.text())).collect();
-            summary.push(format!(
-                "The paper's {} statements, with {subject} as its DDPG-DMP: {}.",
-                report.claims.results.len(),
-                counts.join(", ")
-            ));
-        }
+    let claims = &report.claims.results;
+    let verdicts = SUBJECTS
+        .into_iter()
+        .filter(|subject| report.results.methods.iter().any(|method| method == subject))
+        .map(|subject| {
+            let counts = counts(claims, subject).into_iter();
+            let counts = counts.map(|(verdict, count)| format!("{count} \"{}\"", verdict.text()));
+            let counts: Vec<String> = counts.collect();
+            format!("{} with {subject} as its DDPG-DMP", counts.join(", "))
+        });
+    let verdicts: Vec<String> = verdicts.collect();
+    if !(claims.is_empty() || verdicts.is_empty()) {
+        let count = claims.len();
+        let verdicts = verdicts.join("; ");
+        summary.push(format!("Verdicts on the paper's {count} statements: {verdicts}."));
     }
     summary.push(TABLES_NOTE.to_owned());
     summary
@@ -134,8 +139,8 @@ fn summary(report: &Report) -> Vec<String> {
 fn main(report: &Report) -> Vec<Section> {
     let results = &report.results;
     // Other tasks have the same tables and figures, which then are not the paper's.
-    let cells = report.tables.iter().flat_map(|table| &table.rows).flat_map(|(_, cells)| cells);
-    let is_papers = cells.into_iter().any(|cell| cell.paper.is_some());
+    let mut cells = report.tables.iter().flat_map(|table| &table.rows).flat_map(|(_, row)| row);
+    let is_papers = cells.any(|cell| cell.paper.is_some());
     let title = |title: &str, place: &str| {
         if is_papers { format!("{title} ({place})") } else { title.to_owned() }
     };
@@ -151,6 +156,7 @@ fn main(report: &Report) -> Vec<Section> {
         curves.finding = findings::first_to_threshold(&report.efficiency, &results.methods);
         curves.about.extend(is_papers.then(|| CURVES_OF_PAPER.to_owned()));
         curves.pictures = report.curves.main.clone();
+        curves.has_pairs = true;
         sections.push(curves);
     }
     if !report.pareto.is_empty() {
@@ -159,7 +165,8 @@ fn main(report: &Report) -> Vec<Section> {
         let keys = families::keys(&results.methods);
         if !keys.is_empty() {
             pareto.about.push(format!(
-                "The numbers beside the points are values of {}; a thin line connects them.",
+                "The numbers beside the points are values of {}. A thin line connects the points \
+                 of a method.",
                 keys.join(", ")
             ));
         }
@@ -195,6 +202,7 @@ fn details(report: &Report) -> Vec<Section> {
     if !report.curves.others.is_empty() {
         let mut curves = Section::new("Return of tasks with a success rate", &[CURVES]);
         curves.pictures = report.curves.others.clone();
+        curves.has_pairs = true;
         sections.push(curves);
     }
     sections.extend(of_kind(MeasureKind::Cost));
@@ -214,11 +222,9 @@ fn of_table(report: &Report, table: &Table) -> Section {
         section.about[0].push_str(&format!(" Over {seeds} unless a cell says otherwise."));
     }
     let rows = table.rows.iter().map(|(task, cells)| {
-        let is_best = table.best(cells).into_iter();
-        let marks_best = table.measure.kind() != MeasureKind::Cost;
-        let cells = cells.iter().zip(is_best).map(|(cell, is_best)| GridCell {
+        let cells = cells.iter().zip(table.best(cells)).map(|(cell, is_best)| GridCell {
             lines: cell.lines(table.digits, usual_seeds.as_deref()),
-            is_best: is_best && marks_best,
+            is_best,
         });
         GridRow { name: task.clone(), cells: cells.collect() }
     });

@@ -3,7 +3,7 @@
 use dmprl_run::format::grouped;
 use serde::Serialize;
 
-use super::measures::Measure;
+use super::measures::{Measure, MeasureKind};
 use super::paper::reported;
 use super::provenance::SoftwareCounts;
 use super::results::Results;
@@ -95,15 +95,15 @@ impl Table {
     }
 
     /// Returns for each cell of a row whether its mean is the best. No cell is the best if only one
-    /// has a mean, or if all means are equal.
+    /// has a mean, if all means are equal, or if the measure is a cost.
     #[must_use]
     pub fn best(&self, cells: &[Cell]) -> Vec<bool> {
         let sign = if self.measure.higher_is_better() { 1.0 } else { -1.0 };
         let mean = |cell: &Cell| cell.summary.as_ref().map(|summary| sign * summary.mean);
         let means = || cells.iter().filter_map(mean);
         let best = means().fold(f64::NEG_INFINITY, f64::max);
-        let differs = means().any(|mean| mean < best);
-        cells.iter().map(|cell| differs && mean(cell) == Some(best)).collect()
+        let is_ranked = self.measure.kind() != MeasureKind::Cost && means().any(|mean| mean < best);
+        cells.iter().map(|cell| is_ranked && mean(cell) == Some(best)).collect()
     }
 }
 

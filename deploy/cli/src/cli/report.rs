@@ -19,12 +19,16 @@ use super::trust::TrustArgs;
 use super::{emit, prepare_python, prepare_python_with, this_program};
 use crate::terminal::{TerminalProgress, say};
 
+/// Maximum number of methods that a title lists.
+const TITLE_METHODS_MAX: usize = 5;
+
 const HELP: &str = "\
 Writes index.html (one self-contained page), report.md, figures.csv, runs.csv, report-data.json and
-every picture as SVG and PNG. Tables show mean and standard deviation over seeds. With four or more
-seeds they also show the interquartile mean with a 95 % interval by stratified bootstrap (Agarwal
-et al. 2021), with fewer the range. On the paper's tasks they also show the paper's figures. Only
-finished runs count. Figures over runs of different programs or package versions are marked.
+every picture as SVG and PNG. Each table and figure begins with its finding in a sentence. Tables
+show mean and standard deviation over seeds, and with four or more seeds the interquartile mean with
+a 95 % interval by stratified bootstrap (Agarwal et al. 2021). On the paper's tasks they also show
+the paper's figures. Only finished runs count. Figures over runs of different programs or package
+versions are marked.
 Motion is measured once per run, by rolling out its last policy, and kept in the run directory. The
 frames of a rollout are also recorded once; they need an environment that can render.
 The folder of an earlier report can replace run directories that are elsewhere or deleted: its runs
@@ -98,13 +102,8 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         "statements": claims.results,
     });
     let names: Vec<_> = args.runs.iter().map(|path| path.display().to_string()).collect();
-    let title = match (results.tasks.as_slice(), results.methods.as_slice()) {
-        ([task], methods) => format!("{task}: {}", methods.join(", ")),
-        (tasks, [method]) => format!("{method} on {} tasks", tasks.len()),
-        (tasks, methods) => format!("{} methods on {} tasks", methods.len(), tasks.len()),
-    };
     let report = Report {
-        title,
+        title: title(&results),
         command: format!(
             "dmprl report {}{}",
             names.join(" "),
@@ -129,6 +128,17 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     }
     say(&format!("written: {}", shown(&output.join("index.html"))));
     Ok(Outcome::Done)
+}
+
+fn title(results: &Results) -> String {
+    match (results.tasks.as_slice(), results.methods.as_slice()) {
+        ([task], methods) if methods.len() <= TITLE_METHODS_MAX => {
+            format!("{task}: {}", methods.join(", "))
+        }
+        ([task], methods) => format!("{} methods on {task}", methods.len()),
+        (tasks, [method]) => format!("{method} on {} tasks", tasks.len()),
+        (tasks, methods) => format!("{} methods on {} tasks", methods.len(), tasks.len()),
+    }
 }
 
 /// Measures the motion of runs that have no measurement yet. Skips it if Python is unavailable.
