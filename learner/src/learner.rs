@@ -4,6 +4,9 @@
 //! The loop around it ([`crate::session`]) provides these.
 
 mod arrival;
+mod average;
+
+use std::borrow::Cow;
 
 use dmprl_shared::config::ExperimentConfig;
 use dmprl_shared::parameters::ParameterSnapshot;
@@ -27,6 +30,7 @@ use crate::update::network::TrainableNetwork;
 
 pub use crate::error::LearnerError;
 pub use arrival::InsertObserver;
+pub use average::PolicyAverage;
 
 /// Progress of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -92,6 +96,8 @@ pub struct Learner {
     pub normaliser: Option<Normaliser>,
     /// Progress of the run.
     pub counters: Counters,
+    /// The average of the newest policies, if it is configured.
+    pub average: Option<PolicyAverage>,
     collector: MetricsCollector,
     snapshot: ParameterSnapshot,
     /// Newest sequence number of each worker, with the segment log.
@@ -136,6 +142,8 @@ impl Learner {
                 Normaliser::new(layout.observation_len, first, relative)
             }),
             hindsight,
+            average: (config.learner.average_share > 0.0)
+                .then(|| PolicyAverage::new(config.learner.average_share)),
             counters: Counters::default(),
             collector: MetricsCollector::new(layout, workers, envs),
             snapshot: ParameterSnapshot {
@@ -222,6 +230,22 @@ impl Learner {
                 self.count_update(named)?;
                 self.collector.updated_on_policy(losses);
             }
+        }
+        self.average_policy()
+    }
+
+    /// Adds the policy to the average if it is due.
+    fn average_policy(&mut self) -> Result<(), LearnerError> {
+        let updates = self.counters.updates;
+        if let Some(average) = &mut self.average
+            && PolicyAverage::is_due(updates)
+        {
+            let newest = average.newest_mut(self.policy.parameters_len());
+            self.regime.read_policy(newest)?;
+            if let Some(normaliser) = &self.normaliser {
+                normaliser.fold(self.policy.shape(), newest);
+            }
+            average.add(updates);
         }
         Ok(())
     }
@@ -335,6 +359,17 @@ impl Learner {
         &self.snapshot
     }
 
+    /// Returns the policy that is saved and evaluated under the newest version: the average, if it
+    /// is configured.
+    #[must_use]
+    pub fn saved_snapshot(&self) -> Cow<'_, ParameterSnapshot> {
+        let average = self.average.as_ref().map_or(&[][..], PolicyAverage::values);
+        if average.is_empty() {
+            return Cow::Borrowed(&self.snapshot);
+        }
+        Cow::Owned(ParameterSnapshot { values: average.to_vec(), ..self.snapshot })
+    }
+
     /// Sets the actor and its target to the parameters of another policy.
     ///
     /// # Errors
@@ -407,78 +442,4 @@ impl Learner {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
-    use dmprl_shared::config::Hindsight;
-    use dmprl_shared::goal_rule::{GoalReward, GoalRule, Norm};
-    use dmprl_shared::segment::{SegmentHeader, TRUNCATED};
-
-    use super::*;
-
-    pub(crate) fn spec() -> EnvSpec {
-        EnvSpec {
-            id: "Test-v0".into(),
-            observation_len: 4,
-            action_len: 2,
-            action_low: vec![-1.0; 2],
-            action_high: vec![1.0; 2],
-            control_dt_s: 0.02,
-            episode_steps: 10,
-            observation_names: Vec::new(),
-            goal_rule: None,
-        }
-    }
-
-    /// Returns the rule of observations (achieved goal, desired goal, ...) with goals of one entry,
-    /// which are reached within 0.5.
-    pub(crate) fn goal_rule() -> GoalRule {
-        GoalRule {
-            achieved: 0,
-            desired: 1,
-            goal_len: 1,
-            components: vec![0],
-            norm: Norm::Euclidean,
-            reward: GoalReward::Sparse { threshold: 0.5, reached: 0.0, missed: -1.0 },
-            ends_within: None,
-        }
-    }
-
-    #[test]
-    fn a_snapshot_is_settled_if_half_of_the_recent_episodes_move_the_achieved_goal() {
-        let spec = EnvSpec { goal_rule: Some(goal_rule().into()), ..spec() };
-        let mut config = ExperimentConfig::default();
-        config.replay.hindsight = Hindsight::Future;
-        // Segments are counted by hundreds; each is an episode here.
-        for (moving, expected) in [(49, false), (50, true)] {
-            let mut learner = Learner::new(config.clone(), &spec, 1).unwrap();
-            let layout = learner.replay.layout();
-            for episode in 0..100 {
-                let mut block = vec![0.0; layout.block_len()];
-                // The achieved goal after the last step.
-                let last = layout.segment_steps * layout.observation_len;
-                block[last] = if episode < moving { 1.0 } else { 0.0 };
-                let steps_len = layout.segment_steps as u32;
-                let header =
-                    SegmentHeader { episode, steps_len, flags: TRUNCATED, ..Default::default() };
-                learner.replay.insert(&header, &block);
-            }
-            // No update has been made, as after a resume.
-            assert_eq!(learner.next_snapshot().unwrap().settled, expected, "{moving} of 100");
-        }
-    }
-
-    #[test]
-    fn a_warm_start_of_plain_observations_remains_the_same_policy_with_relative_goals() {
-        let spec = EnvSpec { goal_rule: Some(goal_rule().into()), ..spec() };
-        let mut config = ExperimentConfig::default();
-        config.replay.hindsight = Hindsight::Future;
-        let mut learner = Learner::new(config, &spec, 1).unwrap();
-        let start: Vec<f32> = learner.next_snapshot().unwrap().values.clone();
-        learner.warm_start(&start).unwrap();
-        let published = &learner.next_snapshot().unwrap().values;
-        // The weights of the achieved goal are computed, so they are rounded.
-        assert!(start.iter().zip(published).all(|(a, b)| (a - b).abs() < 1e-6));
-        let mut actor = vec![0.0; start.len()];
-        learner.regime.read_policy(&mut actor).unwrap();
-        assert!(start.iter().zip(&actor).any(|(a, b)| (a - b).abs() > 1e-3));
-    }
-}
+pub(crate) mod tests;

@@ -247,7 +247,7 @@ impl<'a> Recorder<'a> {
 
     fn save_policy(&mut self, learner: &Learner) -> Result<EvaluationRequest, DueError> {
         let counters = learner.counters;
-        let bytes = policy_file::encode(learner.policy(), learner.snapshot(), None, None)?;
+        let bytes = policy_file::encode(learner.policy(), &learner.saved_snapshot(), None, None)?;
         self.files.save_policy(counters.policy_version, &bytes)?;
         Ok(EvaluationRequest {
             env_steps: counters.env_steps,

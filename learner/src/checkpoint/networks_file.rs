@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use safetensors::tensor::{Dtype, SafeTensors, View};
 
 use crate::finite::{self, NotFiniteParameter};
-use crate::learner::Learner;
+use crate::learner::{Learner, PolicyAverage};
 use crate::parameters::Parameters;
 
 /// A flat tensor to be written.
@@ -67,17 +67,22 @@ pub(super) fn bytes(learner: &Learner) -> Result<Vec<u8>, String> {
             tensors.push((format!("{name}.{part}"), Flat { len: values.len(), values }));
         }
     }
+    let average = learner.average.as_ref().map_or(&[][..], PolicyAverage::values);
+    if !average.is_empty() {
+        tensors.push((AVERAGE.to_owned(), Flat { len: average.len(), values: average.to_vec() }));
+    }
     safetensors::serialize(tensors, None).map_err(|error| error.to_string())
 }
 
 /// Suffixes of a network's tensors.
 const PARTS: [&str; 4] = ["network", "target", "adam_first", "adam_second"];
+/// The average of the newest policies. Checkpoints of older versions do not have it.
+const AVERAGE: &str = "policy.average";
 
 /// Restores the networks from a file's contents.
 pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
-    let read = |name: &str, part: &str, len: usize| -> Result<Vec<f32>, String> {
-        let name = format!("{name}.{part}");
+    let read = |name: String, len: usize| -> Result<Vec<f32>, String> {
         let tensor = tensors.tensor(&name).map_err(|error| format!("{name}: {error}"))?;
         if tensor.dtype() != Dtype::F32 || tensor.shape() != [len] {
             let (dtype, shape) = (tensor.dtype(), tensor.shape());
@@ -89,6 +94,13 @@ pub(super) fn restore(bytes: &[u8], learner: &mut Learner) -> Result<(), String>
         finite::check(&values, || name).map_err(|error| error.to_string())?;
         Ok(values)
     };
+    let policy_len = learner.policy().parameters_len();
+    if let Some(average) = &mut learner.average
+        && tensors.names().contains(&AVERAGE)
+    {
+        average.restore(read(AVERAGE.to_owned(), policy_len)?);
+    }
+    let read = |name: &str, part: &str, len| read(format!("{name}.{part}"), len);
     learner.for_each_network(|name, network| {
         let len = network.adam.moments.first.len();
         let set = |parameters: &mut Parameters, part| {

@@ -128,6 +128,44 @@ fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
 }
 
 #[test]
+fn the_saved_policy_is_an_average_and_workers_get_the_newest_one() {
+    let mut learner = fresh_with(&[]).unwrap();
+    let published = |learner: &mut Learner| learner.next_snapshot().unwrap().values.clone();
+    let mut expected: Vec<f64> = Vec::new();
+    for round in 0..60 {
+        learner.insert(&segment(&learner, round)).unwrap();
+        while learner.update_due() {
+            learner.update().unwrap();
+            let updates = learner.counters.updates;
+            if updates.is_multiple_of(4) {
+                let policy = published(&mut learner);
+                // The first policy counts alone, the n-th with 1 / (1 + 0.1 (n - 1)).
+                let weight = 1.0 / (1.0 + 0.1 * (updates / 4 - 1) as f64);
+                expected.resize(policy.len(), 0.0);
+                for (average, value) in expected.iter_mut().zip(policy) {
+                    *average += weight * (f64::from(value) - *average);
+                }
+            }
+        }
+    }
+    let newest = published(&mut learner);
+    let saved = learner.saved_snapshot();
+    assert!(saved.values.iter().zip(&expected).all(|(a, b)| (f64::from(*a) - b).abs() < 1e-5));
+    assert_ne!(saved.values, newest);
+}
+
+#[test]
+fn a_checkpoint_without_an_average_is_resumed() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut learner = fresh_with(&[("learner.average_share", "0")]).unwrap();
+    train(&mut learner, 0..60);
+    save(folder.path(), &mut learner).unwrap();
+    let (mut learner, _) = load_newest(folder.path(), &|| fresh_with(&[])).unwrap();
+    train(&mut learner, 60..120);
+    assert!(!learner.average.as_ref().unwrap().values().is_empty());
+}
+
+#[test]
 fn a_checkpoint_is_of_its_moment_however_far_training_goes_while_it_is_written() {
     let folder = tempfile::tempdir().unwrap();
     let (at_once, later) = (folder.path().join("at_once"), folder.path().join("later"));

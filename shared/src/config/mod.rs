@@ -10,6 +10,7 @@ mod algorithm;
 pub mod endpoint;
 mod experiment;
 mod layers;
+mod learner;
 mod presets;
 mod randomise;
 mod resolve;
@@ -26,11 +27,12 @@ pub use dmprl_runtime::config::{
 };
 use dmprl_runtime::config::{check_hidden, range};
 pub use experiment::{
-    ActorsConfig, Backend, BridgeConfig, CheckpointConfig, DeliveryConfig, DeliveryLevel,
-    DemonstrationsConfig, Device, EvaluationConfig, ExperimentConfig, Hindsight, LearnerConfig,
-    MetricsConfig, PacingConfig, Precision, ReplayConfig, RunConfig, SupervisionConfig,
+    ActorsConfig, BridgeConfig, CheckpointConfig, DeliveryConfig, DeliveryLevel,
+    DemonstrationsConfig, EvaluationConfig, ExperimentConfig, Hindsight, MetricsConfig,
+    PacingConfig, ReplayConfig, RunConfig, SupervisionConfig,
 };
 pub use layers::{ConfigError, Layers, nearest};
+pub use learner::{Backend, Device, LearnerConfig, Precision};
 pub use presets::{PRESETS, Preset, algorithm_defaults, policy_defaults, suitable_preset};
 pub use randomise::RandomiseConfig;
 pub use resolve::Limits;

@@ -162,6 +162,7 @@ envs_per_worker = 1
 queue_segments = 1
 [learner]
 publish_every_updates = 1
+average_share = 0.0
 "#;
 
 /// Tasks with goals and a sparse reward, ours and those of other packages: the start of a Gymnasium

@@ -220,6 +220,7 @@ impl ExperimentConfig {
             ("exploration.settled_share", self.exploration.settled_share),
             ("exploration.goal_switches", self.exploration.goal_switches),
             ("algorithm.td3.target_smaller_weight", self.algorithm.td3.target_smaller_weight),
+            ("learner.average_share", self.learner.average_share),
         ];
         for (key, got) in shares {
             range(key, got, (0.0..=1.0).contains(&got), || "from 0 to 1".into())?;
@@ -391,6 +392,7 @@ mod tests {
             ("algorithm.action_acceleration_penalty", "inf"),
             ("algorithm.saturation_penalty", "-1"),
             ("algorithm.imitation_penalty", "-1"),
+            ("learner.average_share", "1.5"),
             ("replay.hindsight_share", "1.1"),
             ("replay.other_goals_share", "1.1"),
             ("replay.near_misses_share", "1.1"),
