@@ -342,21 +342,21 @@ impl Learner {
             hindsight.read_recent(&self.replay);
             self.snapshot.settled = hindsight.is_settled();
         }
-        self.regime.read_policy(&mut self.snapshot.values)?;
-        if let Some(normaliser) = &self.normaliser {
-            normaliser.fold(self.policy.shape(), &mut self.snapshot.values);
+        let updates = self.counters.updates;
+        match self.average.as_ref().and_then(|average| average.newest(updates)) {
+            // A policy on a GPU is copied once.
+            Some(newest) => self.snapshot.values.copy_from_slice(newest),
+            None => {
+                self.regime.read_policy(&mut self.snapshot.values)?;
+                if let Some(normaliser) = &self.normaliser {
+                    normaliser.fold(self.policy.shape(), &mut self.snapshot.values);
+                }
+            }
         }
-        let update = self.counters.updates;
         finite::check(&self.snapshot.values, || "policy".to_owned())
-            .map_err(|source| LearnerError::NotFiniteParameter { update, source })?;
+            .map_err(|source| LearnerError::NotFiniteParameter { update: updates, source })?;
         self.regime.policy_published(self.snapshot.version);
         Ok(&self.snapshot)
-    }
-
-    /// Returns the newest snapshot that [`Learner::next_snapshot`] made.
-    #[must_use]
-    pub fn snapshot(&self) -> &ParameterSnapshot {
-        &self.snapshot
     }
 
     /// Returns the policy that is saved and evaluated under the newest version: the average, if it

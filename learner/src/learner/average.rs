@@ -13,8 +13,10 @@ const EVERY_UPDATES: u64 = 4;
 #[derive(Debug, Clone)]
 pub struct PolicyAverage {
     share: f64,
-    /// The policy that is added next.
+    /// The policy that is added next, or was added last.
     newest: Vec<f32>,
+    /// Updates before the policy that was added last; 0 before the first one.
+    newest_updates: u64,
     /// Empty before the first policy.
     values: Vec<f32>,
 }
@@ -23,7 +25,7 @@ impl PolicyAverage {
     /// Makes an average of no policies. `share` is greater than 0 and at most 1.
     #[must_use]
     pub fn new(share: f64) -> Self {
-        Self { share, newest: Vec::new(), values: Vec::new() }
+        Self { share, newest: Vec::new(), newest_updates: 0, values: Vec::new() }
     }
 
     /// Returns whether the policy after `updates` updates is part of the average.
@@ -40,6 +42,7 @@ impl PolicyAverage {
 
     /// Adds the policy after `updates` updates, which is in its place.
     pub fn add(&mut self, updates: u64) {
+        self.newest_updates = updates;
         if self.values.len() != self.newest.len() {
             self.values.clone_from(&self.newest);
             return;
@@ -49,6 +52,12 @@ impl PolicyAverage {
         for (average, value) in self.values.iter_mut().zip(&self.newest) {
             *average += weight * (value - *average);
         }
+    }
+
+    /// Returns the policy after `updates` updates, (P,), if it was added last.
+    #[must_use]
+    pub fn newest(&self, updates: u64) -> Option<&[f32]> {
+        (updates > 0 && updates == self.newest_updates).then_some(&self.newest)
     }
 
     /// Returns the average, (P,), or nothing before the first policy.
