@@ -129,7 +129,7 @@ fn a_resumed_learner_goes_on_to_the_same_bytes_as_one_that_never_stopped() {
 
 #[test]
 fn the_saved_policy_is_an_average_and_workers_get_the_newest_one() {
-    let mut learner = fresh_with(&[]).unwrap();
+    let mut learner = fresh_with(&[("learner.average_share", "0.1")]).unwrap();
     let published = |learner: &mut Learner| learner.next_snapshot().unwrap().values.clone();
     let mut expected: Vec<f64> = Vec::new();
     for round in 0..60 {

@@ -66,7 +66,7 @@ impl Default for LearnerConfig {
             threads: 1,
             precision: Precision::F32,
             publish_every_updates: 4,
-            average_share: 0.1,
+            average_share: 0.05,
         }
     }
 }
