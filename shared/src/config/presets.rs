@@ -251,6 +251,7 @@ forcing_scaling = "goal"
 actor_learning_rate = 0.0003
 critic_learning_rate = 0.0003
 critic_hidden = [256, 256]
+critic_layer_norm = false
 action_rate_penalty = 0.0
 [exploration]
 random_segments = 0.0
