@@ -5,11 +5,10 @@ const EVERY_UPDATES: u64 = 4;
 
 /// Polynomial-decay average of the policies after every fourth update.
 ///
-/// A policy is better after some updates than after others. Its average is steadier,
-/// and usually better (docs/decisions/0128-average-of-policies.md). With η = 1 / share - 1, this is
-/// the average of Shamir and Zhang 2013, "Stochastic Gradient Descent for Non-smooth Optimization",
-/// section 4: about the last `share` of all policies have most of the weight, however many there
-/// are.
+/// A policy is better after some updates than after others. Its average is steadier, and usually
+/// better (docs/decisions/0128-average-of-policies.md). With η = 1 / share - 1, this is the average
+/// of Shamir and Zhang 2013, "Stochastic Gradient Descent for Non-smooth Optimization". About the
+/// last `share` of all policies have most of the weight, however many there are.
 #[derive(Debug, Clone)]
 pub struct PolicyAverage {
     share: f64,
