@@ -241,10 +241,7 @@ impl Learner {
             && PolicyAverage::is_due(updates)
         {
             let newest = average.newest_mut(self.policy.parameters_len());
-            self.regime.read_policy(newest)?;
-            if let Some(normaliser) = &self.normaliser {
-                normaliser.fold(self.policy.shape(), newest);
-            }
+            read_policy(&self.regime, self.normaliser.as_ref(), &self.policy, newest)?;
             average.add(updates);
         }
         Ok(())
@@ -343,15 +340,11 @@ impl Learner {
             self.snapshot.settled = hindsight.is_settled();
         }
         let updates = self.counters.updates;
+        let values = &mut self.snapshot.values;
         match self.average.as_ref().and_then(|average| average.newest(updates)) {
             // A policy on a GPU is copied once.
-            Some(newest) => self.snapshot.values.copy_from_slice(newest),
-            None => {
-                self.regime.read_policy(&mut self.snapshot.values)?;
-                if let Some(normaliser) = &self.normaliser {
-                    normaliser.fold(self.policy.shape(), &mut self.snapshot.values);
-                }
-            }
+            Some(newest) => values.copy_from_slice(newest),
+            None => read_policy(&self.regime, self.normaliser.as_ref(), &self.policy, values)?,
         }
         finite::check(&self.snapshot.values, || "policy".to_owned())
             .map_err(|source| LearnerError::NotFiniteParameter { update: updates, source })?;
@@ -439,6 +432,20 @@ impl Learner {
             updates_per_s: 0.0,
         }
     }
+}
+
+/// Reads the parameters of the policy for plain observations, (P,).
+fn read_policy(
+    regime: &Regime,
+    normaliser: Option<&Normaliser>,
+    policy: &Policy,
+    values: &mut [f32],
+) -> Result<(), LearnerError> {
+    regime.read_policy(values)?;
+    if let Some(normaliser) = normaliser {
+        normaliser.fold(policy.shape(), values);
+    }
+    Ok(())
 }
 
 #[cfg(test)]
