@@ -223,17 +223,7 @@ mod tests {
     /// Creates a new policy with some observations, and exploration for it.
     fn scene(keys: &[(&str, &str)]) -> (PolicyRunner, Exploration) {
         let config = config(keys);
-        let spec = EnvSpec {
-            id: "Test-v0".into(),
-            observation_len: 4,
-            observation_names: Vec::new(),
-            goal_rule: None,
-            action_len: DIMS,
-            action_low: vec![-1.0; DIMS],
-            action_high: vec![1.0; DIMS],
-            control_dt_s: 0.02,
-            episode_steps: 50,
-        };
+        let spec = EnvSpec::new("Test-v0", 4, &[(-1.0, 1.0); DIMS], 0.02, 50);
         let policy = Policy::new(config.policy_description(&spec)).unwrap();
         let parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         let mut runner = PolicyRunner::new(policy, ENVS);

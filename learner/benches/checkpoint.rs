@@ -16,17 +16,7 @@ use dmprl_shared::spec::EnvSpec;
 
 fn learner(gigabytes: f64) -> Learner {
     let mut layers = Layers::new();
-    let spec = EnvSpec {
-        id: "Pusher-v5".into(),
-        observation_len: 23,
-        action_len: 7,
-        action_low: vec![-2.0; 7],
-        action_high: vec![2.0; 7],
-        control_dt_s: 0.05,
-        episode_steps: 100,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    };
+    let spec = EnvSpec::new("Pusher-v5", 23, &[(-2.0, 2.0); 7], 0.05, 100);
     let sizes = Learner::new(Layers::new().finish().expect("defaults"), &spec, 1);
     let layout = sizes.expect("a learner").policy().layout();
     let segments = (gigabytes * 1e9) as usize / (layout.block_len() * size_of::<f32>());

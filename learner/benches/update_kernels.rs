@@ -65,17 +65,7 @@ fn config(threads: &str, precision: &str, norm: &str) -> (ExperimentConfig, EnvS
     for (key, value) in keys {
         layers.set("bench", key, value).expect("a known key");
     }
-    let spec = EnvSpec {
-        id: "Pusher-v5".into(),
-        observation_len: 23,
-        action_len: 7,
-        action_low: vec![-2.0; 7],
-        action_high: vec![2.0; 7],
-        control_dt_s: 0.05,
-        episode_steps: 100,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    };
+    let spec = EnvSpec::new("Pusher-v5", 23, &[(-2.0, 2.0); 7], 0.05, 100);
     (layers.finish().expect("a valid configuration"), spec)
 }
 

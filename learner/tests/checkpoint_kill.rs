@@ -53,17 +53,7 @@ fn fresh() -> Result<Learner, LearnerError> {
     for (key, value) in small {
         layers.set("test", key, value).unwrap();
     }
-    let spec = EnvSpec {
-        id: "Test-v0".into(),
-        observation_len: 4,
-        action_len: 2,
-        action_low: vec![-1.0; 2],
-        action_high: vec![1.0; 2],
-        control_dt_s: 0.02,
-        episode_steps: 10,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    };
+    let spec = EnvSpec::new("Test-v0", 4, &[(-1.0, 1.0); 2], 0.02, 10);
     Learner::new(layers.finish().unwrap(), &spec, RUN_ID)
 }
 

@@ -21,14 +21,6 @@ use skipped::skipped;
 
 fn spec() -> EnvSpec {
     EnvSpec {
-        id: "Test-v0".into(),
-        observation_len: 9,
-        action_len: 2,
-        action_low: vec![-1.0; 2],
-        action_high: vec![1.0; 2],
-        control_dt_s: 0.05,
-        episode_steps: 50,
-        observation_names: Vec::new(),
         goal_rule: Some(Box::new(GoalRule {
             achieved: 0,
             desired: 3,
@@ -38,6 +30,7 @@ fn spec() -> EnvSpec {
             reward: GoalReward::Sparse { threshold: 0.05, reached: 0.0, missed: -1.0 },
             ends_within: None,
         })),
+        ..EnvSpec::new("Test-v0", 9, &[(-1.0, 1.0); 2], 0.05, 50)
     }
 }
 

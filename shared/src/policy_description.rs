@@ -48,17 +48,7 @@ mod tests {
     use crate::policy::Policy;
 
     fn spec() -> EnvSpec {
-        EnvSpec {
-            id: "Reacher-v5".into(),
-            observation_len: 10,
-            action_len: 2,
-            action_low: vec![-1.0; 2],
-            action_high: vec![1.0; 2],
-            control_dt_s: 0.02,
-            episode_steps: 50,
-            observation_names: Vec::new(),
-            goal_rule: None,
-        }
+        EnvSpec::new("Reacher-v5", 10, &[(-1.0, 1.0); 2], 0.02, 50)
     }
 
     fn hash_of(keys: &[(&str, &str)]) -> u64 {

@@ -47,18 +47,8 @@ fn config(task: &str, keys: &[(&str, &str)]) -> ExperimentConfig {
 /// Asymmetric bounds: scaling must use both.
 fn spec(task: &str) -> EnvSpec {
     let task = task_defaults(task).unwrap();
-    let (observation_len, action_len) = (task.observation_len, task.action_low.len());
-    EnvSpec {
-        id: "Test-v0".into(),
-        observation_len,
-        observation_names: Vec::new(),
-        goal_rule: None,
-        action_len,
-        action_low: vec![-1.0; action_len],
-        action_high: vec![3.0; action_len],
-        control_dt_s: 0.02,
-        episode_steps: 50,
-    }
+    let bounds = vec![(-1.0, 3.0); task.action_low.len()];
+    EnvSpec::new("Test-v0", task.observation_len, &bounds, 0.02, 50)
 }
 
 fn read(path: &Path) -> Vec<f32> {

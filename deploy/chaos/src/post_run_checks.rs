@@ -219,17 +219,7 @@ mod tests {
     fn line(env_steps: u64, updates: u64) -> Value {
         let mut config = ExperimentConfig::default();
         config.actors.workers = 1;
-        let spec = EnvSpec {
-            id: "Fake-v0".into(),
-            observation_len: 2,
-            action_len: 1,
-            action_low: vec![-1.0],
-            action_high: vec![1.0],
-            control_dt_s: 0.02,
-            episode_steps: 50,
-            observation_names: Vec::new(),
-            goal_rule: None,
-        };
+        let spec = EnvSpec::new("Fake-v0", 2, &[(-1.0, 1.0)], 0.02, 50);
         config.replay.capacity_steps = 1_000;
         let mut learner = Learner::new(config, &spec, 1).unwrap();
         learner.counters.env_steps = env_steps;

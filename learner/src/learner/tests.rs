@@ -7,17 +7,7 @@ use dmprl_shared::segment::{SegmentHeader, TRUNCATED};
 use super::*;
 
 pub(crate) fn spec() -> EnvSpec {
-    EnvSpec {
-        id: "Test-v0".into(),
-        observation_len: 4,
-        action_len: 2,
-        action_low: vec![-1.0; 2],
-        action_high: vec![1.0; 2],
-        control_dt_s: 0.02,
-        episode_steps: 10,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    }
+    EnvSpec::new("Test-v0", 4, &[(-1.0, 1.0); 2], 0.02, 10)
 }
 
 /// Returns the rule of observations (achieved goal, desired goal, ...) with goals of one entry,

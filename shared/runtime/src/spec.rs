@@ -88,6 +88,30 @@ pub enum SpecError {
 }
 
 impl EnvSpec {
+    /// Returns the spec of an environment whose observations have no names, and whose goals follow
+    /// no rule. `action_bounds` are the lower and upper bound of each action dimension.
+    #[must_use]
+    pub fn new(
+        id: &str,
+        observation_len: usize,
+        action_bounds: &[(f64, f64)],
+        control_dt_s: f64,
+        episode_steps: u32,
+    ) -> Self {
+        let (action_low, action_high): (Vec<_>, Vec<_>) = action_bounds.iter().copied().unzip();
+        Self {
+            id: id.into(),
+            observation_len,
+            action_len: action_bounds.len(),
+            action_low,
+            action_high,
+            control_dt_s,
+            episode_steps,
+            observation_names: Vec::new(),
+            goal_rule: None,
+        }
+    }
+
     /// Checks lengths, bounds and the duration of a step.
     ///
     /// # Errors

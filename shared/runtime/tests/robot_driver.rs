@@ -122,17 +122,7 @@ impl Drop for Driver {
 
 /// Encodes a policy with large parameters, so that its actions are far from each other.
 fn policy(hold: Option<&Hold>) -> Vec<u8> {
-    let spec = EnvSpec {
-        id: "Test-v0".into(),
-        observation_len: 4,
-        action_len: 2,
-        action_low: vec![-10.0, -10.0],
-        action_high: vec![10.0, 10.0],
-        control_dt_s: STEP_S,
-        episode_steps: 50,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    };
+    let spec = EnvSpec::new("Test-v0", 4, &[(-10.0, 10.0), (-10.0, 10.0)], STEP_S, 50);
     let description = PolicyDescription {
         spec,
         algorithm: AlgorithmName::Td3,

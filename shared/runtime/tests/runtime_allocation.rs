@@ -15,17 +15,7 @@ use dmprl_runtime::{PolicyRuntime, seeds};
 /// The only test in its binary, because the counter counts all threads.
 #[test]
 fn decisions_steps_and_holds_allocate_nothing() {
-    let spec = EnvSpec {
-        id: "Test-v0".into(),
-        observation_len: 4,
-        action_len: 2,
-        action_low: vec![-1.0; 2],
-        action_high: vec![1.0; 2],
-        control_dt_s: 0.05,
-        episode_steps: 50,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    };
+    let spec = EnvSpec::new("Test-v0", 4, &[(-1.0, 1.0); 2], 0.05, 50);
     for config in [
         PolicyConfig::default(),
         PolicyConfig { kind: PolicyKind::Mlp, ..PolicyConfig::default() },

@@ -16,17 +16,7 @@ pub const WORKERS: u32 = 2;
 pub const ENVS: u32 = 3;
 
 pub fn spec() -> EnvSpec {
-    EnvSpec {
-        id: "Test-v0".into(),
-        observation_len: 4,
-        action_len: 2,
-        action_low: vec![-1.0; 2],
-        action_high: vec![1.0; 2],
-        control_dt_s: 0.02,
-        episode_steps: 10,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    }
+    EnvSpec::new("Test-v0", 4, &[(-1.0, 1.0); 2], 0.02, 10)
 }
 
 /// Small sizes, so that a case takes a fraction of a millisecond; no worker may join.

@@ -61,16 +61,6 @@ pub(super) mod tests {
 
     /// Returns the spec of a small environment.
     pub(in super::super) fn small_spec() -> EnvSpec {
-        EnvSpec {
-            id: "Test-v0".into(),
-            observation_len: 4,
-            action_len: 2,
-            action_low: vec![-1.0; 2],
-            action_high: vec![1.0; 2],
-            control_dt_s: 0.02,
-            episode_steps: 10,
-            observation_names: Vec::new(),
-            goal_rule: None,
-        }
+        EnvSpec::new("Test-v0", 4, &[(-1.0, 1.0); 2], 0.02, 10)
     }
 }

@@ -222,18 +222,8 @@ fn temporary_folder() -> anyhow::Result<tempfile::TempDir> {
 
 /// Returns the spec of an environment whose segments have this size.
 fn spec_of(size: Size) -> EnvSpec {
-    let action_len = size.layout.action_len;
-    EnvSpec {
-        id: "Synthetic-v0".into(),
-        observation_len: size.layout.observation_len,
-        action_len,
-        action_low: vec![-1.0; action_len],
-        action_high: vec![1.0; action_len],
-        control_dt_s: 0.02,
-        episode_steps: 50,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    }
+    let bounds = vec![(-1.0, 1.0); size.layout.action_len];
+    EnvSpec::new("Synthetic-v0", size.layout.observation_len, &bounds, 0.02, 50)
 }
 
 #[cfg(test)]

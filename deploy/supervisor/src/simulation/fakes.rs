@@ -61,17 +61,7 @@ pub struct Mode {
 }
 
 pub fn spec() -> EnvSpec {
-    EnvSpec {
-        id: "Fake-v0".into(),
-        observation_len: 2,
-        action_len: 1,
-        action_low: vec![-1.0],
-        action_high: vec![1.0],
-        control_dt_s: 0.02,
-        episode_steps: 50,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    }
+    EnvSpec::new("Fake-v0", 2, &[(-1.0, 1.0)], 0.02, 50)
 }
 
 impl Fake {

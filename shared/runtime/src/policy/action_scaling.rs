@@ -58,17 +58,7 @@ mod tests {
 
     #[test]
     fn the_ends_of_u_are_the_ends_of_each_box_also_an_asymmetric_one() {
-        let spec = EnvSpec {
-            id: "test".into(),
-            observation_len: 1,
-            action_len: 2,
-            action_low: vec![-15.0, 0.0],
-            action_high: vec![15.0, 4.0],
-            control_dt_s: 0.0,
-            episode_steps: 0,
-            observation_names: Vec::new(),
-            goal_rule: None,
-        };
+        let spec = EnvSpec::new("test", 1, &[(-15.0, 15.0), (0.0, 4.0)], 0.0, 0);
         let mut actions = [0.0; 8];
         let u = [-1.0, -1.0, 0.0, 0.0, 1.0, 1.0, -7.0, 1.5];
         ActionScaling::new(&spec, 1.0).apply(&u, &mut actions);

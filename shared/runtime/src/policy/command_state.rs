@@ -52,17 +52,7 @@ mod tests {
             // With `exact` the phase does not depend on the number of steps.
             ("dmp.canonical", "exact"),
         ];
-        let spec = EnvSpec {
-            id: "Test-v0".into(),
-            observation_len: 1,
-            action_len: 2,
-            action_low: vec![-1.0; 2],
-            action_high: vec![1.0; 2],
-            control_dt_s: 0.02,
-            episode_steps: 1000,
-            observation_names: Vec::new(),
-            goal_rule: None,
-        };
+        let spec = EnvSpec::new("Test-v0", 1, &[(-1.0, 1.0); 2], 0.02, 1000);
         let policy = Policy::new(description(spec, &keys)).unwrap();
         let mut parameters = policy.initial_parameters(&mut seeds::stream(1, "test", 0));
         parameters.iter_mut().for_each(|parameter| *parameter *= 3.0);

@@ -120,17 +120,7 @@ mod tests {
     use super::*;
 
     fn spec() -> EnvSpec {
-        EnvSpec {
-            id: "Test-v0".into(),
-            observation_len: 4,
-            action_len: 2,
-            action_low: vec![-1.0, 1.0],
-            action_high: vec![1.0, 4.0],
-            control_dt_s: 0.05,
-            episode_steps: 50,
-            observation_names: Vec::new(),
-            goal_rule: None,
-        }
+        EnvSpec::new("Test-v0", 4, &[(-1.0, 1.0), (1.0, 4.0)], 0.05, 50)
     }
 
     #[test]

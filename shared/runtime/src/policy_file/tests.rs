@@ -5,17 +5,7 @@ use crate::spec::EnvSpec;
 use crate::test_support::description;
 
 fn spec() -> EnvSpec {
-    EnvSpec {
-        id: "Test-v0".into(),
-        observation_len: 4,
-        action_len: 2,
-        action_low: vec![-1.0, 0.0],
-        action_high: vec![1.0, 3.0],
-        control_dt_s: 0.1,
-        episode_steps: 50,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    }
+    EnvSpec::new("Test-v0", 4, &[(-1.0, 1.0), (0.0, 3.0)], 0.1, 50)
 }
 
 fn policy(keys: &[(&str, &str)]) -> Policy {

@@ -13,17 +13,7 @@ const ROWS: usize = 3;
 fn described(keys: &[(&str, &str)]) -> PolicyDescription {
     let sources = r#"[{ "cos": 0, "sin": 1, "velocity": 2 },
                       { "index": 3, "velocity": 2, "scale": -1.0 }]"#;
-    let spec = EnvSpec {
-        id: "Test-v0".into(),
-        observation_len: 4,
-        action_len: 2,
-        action_low: vec![-1.0; 2],
-        action_high: vec![1.0; 2],
-        control_dt_s: 0.02,
-        episode_steps: 10,
-        observation_names: Vec::new(),
-        goal_rule: None,
-    };
+    let spec = EnvSpec::new("Test-v0", 4, &[(-1.0, 1.0); 2], 0.02, 10);
     let keys = [&[("start_sources", sources)], keys].concat();
     description(spec, &keys)
 }
