@@ -2,10 +2,12 @@
 
 pub mod exported;
 pub mod hosts;
+mod processes;
 pub mod program;
 mod run_files;
 pub mod skip_list;
 pub mod skipped;
+mod waiting;
 
 use std::path::{Path, PathBuf};
 

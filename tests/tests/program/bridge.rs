@@ -6,7 +6,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use dmprl_tests::program::{
-    Running, Workplace, json_file, processes_naming, rows, shared_memory_of,
+    Running, Workplace, json_file, process_naming, processes_naming, rows, shared_memory_of,
 };
 use rustix::process::Signal;
 
@@ -46,12 +46,6 @@ fn bridge_with(place: &Workplace, run: &str, endpoint: &str, name: &str, more: &
     place.start(&[&["bridge"], &connect[..], &own, more].concat())
 }
 
-fn strike(run: &str, role: &str, signal: Signal) {
-    let processes = processes_naming(run);
-    let process = processes.iter().find(|process| process.role == role);
-    process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(signal);
-}
-
 fn last(run: &str) -> serde_json::Value {
     rows(run, "metrics.jsonl").pop().unwrap_or_default()
 }
@@ -84,14 +78,14 @@ fn another_hosts_worker_is_learned_from_whoever_dies_and_nothing_is_lost() {
     training.until("a line that counts both workers", |_| last(&run)["workers"] == 2);
     let mut before = 0;
     for (who, role) in [("far", "relay"), ("run", "gateway"), ("run", "learner")] {
-        strike(&place.path(who), role, Signal::KILL);
+        process_naming(&place.path(who), role).signal(Signal::KILL);
         training.until("segments of the other host after that", |_| learned(&run, REMOTE) > before);
         // Beyond the segments that were in transit.
         before = learned(&run, REMOTE) + 20;
         training.until("more of them", |_| learned(&run, REMOTE) > before);
     }
     let first = incarnation(&run, REMOTE);
-    strike(&place.path("far"), "actor", Signal::KILL);
+    process_naming(&place.path("far"), "actor").signal(Signal::KILL);
     training.until("segments of its next start", |_| incarnation(&run, REMOTE) > first);
     host.until_said("restart 1 of");
     // Kills the whole host at once, without a farewell. Started again, it gets its places back.

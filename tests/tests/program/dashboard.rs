@@ -314,9 +314,7 @@ fn a_restarted_worker_and_a_session_that_was_killed_are_told() {
     };
     until("a worker", || actor().is_some());
     assert_eq!(actor().unwrap()["starts"], 1);
-    let processes = place.processes();
-    let worker = processes.iter().find(|one| one.role == "actor").expect("a worker");
-    worker.signal(Signal::KILL);
+    place.process("actor").signal(Signal::KILL);
     until("another start", || actor().is_some_and(|row| row["starts"] == 2));
     training.signal_group(Signal::KILL);
     until("its end", || listed(&address, "one").is_some_and(|one| one["state"] == "stopped"));

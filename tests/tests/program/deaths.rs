@@ -22,12 +22,6 @@ fn training(place: &Workplace, run: &str, more: &[&str]) -> Running {
     running
 }
 
-fn signal_role(place: &Workplace, role: &str, signal: Signal) {
-    let processes = place.processes();
-    let process = processes.iter().find(|process| process.role == role);
-    process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(signal);
-}
-
 /// The event of the first death of a process, which is restarted.
 fn death(process: &str, how: &str) -> Value {
     json!({ "event": "child_died", "process": process, "how": how, "restart": 1 })
@@ -103,13 +97,13 @@ fn resume_waits_for_the_learner_of_a_killed_supervisor() {
     let place = Workplace::new();
     let run = place.path("run");
     let running = training(&place, &run, &[]);
-    signal_role(&place, "learner", Signal::STOP);
+    place.process("learner").signal(Signal::STOP);
     running.signal(Signal::KILL);
     running.wait();
     let reached = env_steps_of(&run).unwrap();
     let mut resuming = place.start(&["resume", &run]);
     resuming.until_said("waiting up to");
-    signal_role(&place, "learner", Signal::CONT);
+    place.process("learner").signal(Signal::CONT);
     // Training continues from a checkpoint that the old learner wrote in the meantime.
     resuming.until_steps(&run, reached + 2_000);
     resuming.signal_group(Signal::INT);
@@ -128,9 +122,9 @@ fn a_run_whose_learner_sleeps_for_a_while_goes_on() {
     let keys: Vec<&str> = keys.into_iter().flat_map(|key| ["--set", key]).collect();
     let mut running = training(&place, &run, &keys);
     let workers = ids(&place, "actor");
-    signal_role(&place, "learner", Signal::STOP);
+    place.process("learner").signal(Signal::STOP);
     running.until_said("waited 7 s: its queue is full");
-    signal_role(&place, "learner", Signal::CONT);
+    place.process("learner").signal(Signal::CONT);
     let steps = env_steps_of(&run).unwrap();
     running.until_steps(&run, steps + 2_000);
     assert_eq!(ids(&place, "actor"), workers, "{}", running.said());
@@ -145,7 +139,7 @@ fn a_killed_worker_is_announced_and_replaced() {
     let place = Workplace::new();
     let run = place.path("run");
     let mut running = training(&place, &run, &[]);
-    signal_role(&place, "actor", Signal::KILL);
+    place.process("actor").signal(Signal::KILL);
     running.until_event(&death("actor-0", "died"));
     let steps = env_steps_of(&run).unwrap();
     running.until_steps(&run, steps + 1_500);
@@ -162,7 +156,7 @@ fn a_worker_that_somebody_stopped_is_said_to_hang_and_replaced() {
     let place = Workplace::new();
     let run = place.path("run");
     let mut running = training(&place, &run, &["--set", "supervision.heartbeat_timeout_s=5"]);
-    signal_role(&place, "actor", Signal::STOP);
+    place.process("actor").signal(Signal::STOP);
     running.until_event(&death("actor-0", "hung"));
     let steps = env_steps_of(&run).unwrap();
     running.until_steps(&run, steps + 1_500);
@@ -178,7 +172,7 @@ fn learner_that_hangs_is_killed_and_replaced_from_its_checkpoint() {
     let run = place.path("run");
     let mut running = training(&place, &run, &["--set", "supervision.learner_timeout_s=5"]);
     let workers = ids(&place, "actor");
-    signal_role(&place, "learner", Signal::STOP);
+    place.process("learner").signal(Signal::STOP);
     running.until_event(&death("learner", "hung"));
     running.until_event(&json!({ "event": "first_step", "after_restart": true }));
     let steps = env_steps_of(&run).unwrap();
@@ -237,7 +231,7 @@ fn a_killed_evaluator_answers_after_its_restart() {
     let place = Workplace::new();
     let run = place.path("run");
     let mut running = training(&place, &run, &[]);
-    signal_role(&place, "evaluator", Signal::KILL);
+    place.process("evaluator").signal(Signal::KILL);
     running.until_event(&death("evaluator", "died"));
     let rows_before = rows(&run, "evaluations.jsonl").len();
     running.until("another row", |_| rows(&run, "evaluations.jsonl").len() > rows_before);
@@ -255,7 +249,7 @@ fn ids(place: &Workplace, role: &str) -> Vec<i32> {
 
 /// Kills the learner, and waits for the next one's first segment and some of its steps.
 fn replace_learner(place: &Workplace, run: &str, running: &mut Running, deaths: usize) {
-    signal_role(place, "learner", Signal::KILL);
+    place.process("learner").signal(Signal::KILL);
     let back = |running: &Running| {
         let events = running.events();
         events.iter().filter(|event| event["after_restart"] == true).count() == deaths
@@ -319,7 +313,7 @@ fn a_learner_killed_once_too_often_ends_the_run_with_its_log_and_advice() {
     let place = Workplace::new();
     let run = place.path("run");
     let running = training(&place, &run, &["--set", "supervision.learner_restarts_max=0"]);
-    signal_role(&place, "learner", Signal::KILL);
+    place.process("learner").signal(Signal::KILL);
     let reached = env_steps_of(&run).unwrap();
     running
         .wait()

@@ -18,12 +18,6 @@ const LOG: [&str; 2] = ["--set", "delivery.level=log"];
 /// Only a full log triggers a checkpoint.
 const NO_CHECKPOINTS: [&str; 2] = ["--set", "checkpoint.interval_steps=1000000"];
 
-fn signal_role(place: &Workplace, role: &str, signal: Signal) {
-    let processes = place.processes();
-    let process = processes.iter().find(|process| process.role == role);
-    process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(signal);
-}
-
 fn last_metrics(run: &str) -> Value {
     rows(run, "metrics.jsonl").pop().unwrap()
 }
@@ -121,17 +115,17 @@ fn a_learner_killed_while_it_comes_to_its_end_does_so_after_its_restart() {
     let mut running = place.start(&train("reacher", &run, &more.concat()));
     // No evaluation yet: an evaluation would end the run.
     running.until("an evaluator", |_| place.processes().iter().any(|it| it.role == "evaluator"));
-    signal_role(&place, "evaluator", Signal::STOP);
+    place.process("evaluator").signal(Signal::STOP);
     let acknowledged = || {
         let last = rows(&run, "metrics.jsonl").pop();
         last.and_then(|last| last["delivery"]["acked"].as_u64()).unwrap_or(0)
     };
     running.until("acknowledged segments", |_| acknowledged() > 0);
     let promised = acknowledged();
-    signal_role(&place, "learner", Signal::STOP);
-    signal_role(&place, "evaluator", Signal::CONT);
+    place.process("learner").signal(Signal::STOP);
+    place.process("evaluator").signal(Signal::CONT);
     running.until_said("the return has reached -1000");
-    signal_role(&place, "learner", Signal::KILL);
+    place.process("learner").signal(Signal::KILL);
     let finished = running.wait().with_status(0);
     let finished = finished.saying("learner died (signal 9").saying("read from the segment log");
     let last = last_metrics(&run);
@@ -163,7 +157,7 @@ fn a_learner_killed_in_the_middle_of_a_checkpoint_goes_on_from_the_one_before() 
         running.until("a checkpoint that is being written", |_| {
             let found = half_written() > 0;
             if found {
-                signal_role(&place, "learner", Signal::KILL);
+                place.process("learner").signal(Signal::KILL);
             }
             found
         });

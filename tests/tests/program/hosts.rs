@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use dmprl_tests::hosts::Hosts;
 use dmprl_tests::program::{
-    Running, Workplace, executable, json_file, processes_naming, rows, shared_memory_of,
+    Running, Workplace, executable, json_file, process_naming, rows, shared_memory_of,
 };
 use dmprl_tests::project_root;
 use dmprl_tests::skipped::skipped;
@@ -40,12 +40,6 @@ fn start(place: &Workplace, hosts: &Hosts, host: usize, arguments: &[&str]) -> R
     command.args(arguments);
     hosts.place(host, &mut command);
     place.start_command(command)
-}
-
-fn strike(run: &str, role: &str) {
-    let processes = processes_naming(run);
-    let process = processes.iter().find(|process| process.role == role);
-    process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(Signal::KILL);
 }
 
 /// Returns the segments of each other host's worker in the newest checkpoint.
@@ -106,7 +100,7 @@ fn three_hosts_lose_nothing_on_a_long_lossy_wire_that_is_cut_while_processes_die
     bridges[1].until_said("the learner's host is back");
     hosts.delay(Duration::from_millis(10));
     for (run_of, role) in [(&far[0], "relay"), (&run, "gateway"), (&run, "learner")] {
-        strike(run_of, role);
+        process_naming(run_of, role).signal(Signal::KILL);
         until_more(&mut training, &run, &[0, 1], "segments of both hosts after a death");
     }
     cut(&hosts, &mut training, &run, 60);

@@ -25,12 +25,6 @@ fn training(place: &Workplace, run: &str) -> Running {
     running
 }
 
-fn stop_role(place: &Workplace, role: &str) {
-    let processes = place.processes();
-    let process = processes.iter().find(|process| process.role == role);
-    process.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).signal(Signal::STOP);
-}
-
 fn assert_nothing_left(place: &Workplace, run: &str) {
     place.assert_no_process();
     assert_eq!(shared_memory_of(run), Vec::<std::path::PathBuf>::new());
@@ -109,7 +103,7 @@ fn ctrl_c_twice_ends_a_run_whose_learner_hangs() {
     let place = Workplace::new();
     let run = place.path("run");
     let mut running = training(&place, &run);
-    stop_role(&place, "learner");
+    place.process("learner").signal(Signal::STOP);
     // Read only now: until it was stopped, the learner could write a checkpoint.
     let before = env_steps_of_checkpoint(&run);
     running.signal_group(Signal::INT);
@@ -130,7 +124,7 @@ fn ctrl_c_once_ends_a_run_whose_worker_hangs_and_writes_the_checkpoint() {
     let place = Workplace::new();
     let run = place.path("run");
     let running = training(&place, &run);
-    stop_role(&place, "actor");
+    place.process("actor").signal(Signal::STOP);
     running.signal_group(Signal::INT);
     let killed = json!({ "event": "killed", "processes": ["actor-0"] });
     running.wait().with_status(130).with_event(&killed).with_event(&interrupted());

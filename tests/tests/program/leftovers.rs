@@ -61,8 +61,7 @@ fn clean_leaves_the_learner_of_a_killed_supervisor_its_shared_memory() {
     let run = place.path("run");
     let running = training(&place, &run);
     let domain = shared_memory_of(&run);
-    let processes = place.processes();
-    let learner = processes.iter().find(|process| process.role == "learner").unwrap();
+    let learner = place.process("learner");
     learner.signal(Signal::STOP);
     running.signal(Signal::KILL);
     running.wait();

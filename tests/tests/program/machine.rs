@@ -17,12 +17,6 @@ use serde_json::json;
 use crate::isolation::with_shared_memory_of;
 use crate::{ENDLESS, train};
 
-fn role(place: &Workplace, role: &str) -> Process {
-    let processes = place.processes();
-    let found = processes.iter().find(|process| process.role == role);
-    found.unwrap_or_else(|| panic!("no {role} in {processes:#?}")).clone()
-}
-
 /// Processor time of a process per second while a closure runs [clock ticks].
 fn ticks_per_s(process: &Process, meanwhile: impl FnOnce()) -> f64 {
     let ticks = || process.cpu_ticks().expect("a living process") as f64;
@@ -39,7 +33,7 @@ fn a_worker_whose_learner_takes_nothing_sleeps() {
     let more = ["--steps", ENDLESS, "--set", "actors.send_deadline_s=0.25"];
     let mut running = place.start(&train("reacher", &run, &more));
     running.until_steps(&run, 2_500);
-    let (worker, learner) = (role(&place, "actor"), role(&place, "learner"));
+    let (worker, learner) = (place.process("actor"), place.process("learner"));
     let stepping = ticks_per_s(&worker, || running.until_steps(&run, 2_500 + 10_000));
     learner.signal(Signal::STOP);
     running.until_said("has waited 1 s: its queue is full");
@@ -95,7 +89,7 @@ fn a_worker_killed_by_full_shared_memory_is_told_the_cause_and_replaced() {
     let Some(command) = with_shared_memory_of(64 << 10, &script) else { return };
     let mut running = place.start_command(command);
     running.until_steps(&run, 1_000);
-    let learner = role(&place, "learner");
+    let learner = place.process("learner");
     // The worker reaches pages that it has never used: its queue is long, and the learner takes
     // nothing.
     learner.signal(Signal::STOP);
@@ -173,7 +167,7 @@ fn a_learner_killed_for_want_of_memory_is_told_so_and_replaced() {
     let mut running =
         place.start(&train("reacher", &run, &["--steps", ENDLESS, "--events", "json"]));
     running.until_steps(&run, 2_500);
-    if memory.take(role(&place, "learner").id).is_err() {
+    if memory.take(place.process("learner").id).is_err() {
         return skip();
     }
     until_death(&mut running, "learner", "signal 9 (SIGKILL), perhaps out of memory");

@@ -8,12 +8,6 @@
 )]
 
 mod bench;
-mod bench_learner;
-mod bench_peers;
-mod bench_policy;
-mod bench_scale;
-mod bench_system;
-mod bench_transport;
 #[cfg(feature = "hosts")]
 mod bridge;
 mod browser;

@@ -48,11 +48,6 @@ fn start_without_locks(place: &Workplace, arguments: &[&str]) -> Running {
     place.start_command(command)
 }
 
-fn signal_learner(place: &Workplace, signal: Signal) {
-    let processes = place.processes();
-    processes.iter().find(|process| process.role == "learner").unwrap().signal(signal);
-}
-
 #[test]
 fn without_file_locks_a_second_trainer_is_refused_and_a_crashed_one_replaced() {
     let place = Workplace::new();
@@ -67,13 +62,13 @@ fn without_file_locks_a_second_trainer_is_refused_and_a_crashed_one_replaced() {
     let refused = start(&["resume", &run]).wait().with_status(1).saying(&holder);
     assert!(!refused.said.contains("waiting"), "{}", refused.said);
     // The learner of a killed supervisor writes a last checkpoint, and is waited for.
-    signal_learner(&place, Signal::STOP);
+    place.process("learner").signal(Signal::STOP);
     running.signal(Signal::KILL);
     running.wait();
     let reached = env_steps_of(&run).unwrap();
     let mut resuming = start(&["resume", &run]);
     resuming.until_said("waiting up to");
-    signal_learner(&place, Signal::CONT);
+    place.process("learner").signal(Signal::CONT);
     resuming.until_steps(&run, reached + 1_000);
     resuming.signal_group(Signal::INT);
     resuming.wait().with_status(130);

@@ -1,29 +1,19 @@
-//! `dmprl bench learner`, in rounds too short for meaningful figures. It needs no Python.
+//! `dmprl bench learner`. It needs no Python.
 
-use std::process::Command;
-
-use dmprl_tests::program::{Running, Workplace, executable};
+use dmprl_tests::program::{Running, Workplace};
 use rustix::process::Signal;
-use serde_json::Value;
 
-/// Starts a benchmark of small networks with its temporary files in the test's folder.
+use super::{assert_no_temporary_files, assert_positive, start};
+
 fn bench(place: &Workplace, more: &[&str]) -> Running {
-    let temporary = place.path("tmp");
-    std::fs::create_dir_all(&temporary).unwrap();
-    let mut command = Command::new(executable());
-    command.args(["bench", "learner", "--set", "policy.hidden=[16]", "--seconds", "0.05"]);
-    command.args(["--set", "algorithm.critic_hidden=[16]", "--set", "algorithm.batch_size=32"]);
-    command.args(more).env("TMPDIR", temporary);
-    place.start_command(command)
+    let short = ["learner", "--seconds", "0.05", "--set", "policy.hidden=[16]"];
+    let small = ["--set", "algorithm.critic_hidden=[16]", "--set", "algorithm.batch_size=32"];
+    start(place, &[&short[..], &small, more].concat())
 }
 
 fn assert_nothing_left(place: &Workplace) {
     place.assert_no_process();
-    assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
-}
-
-fn positive(json: &Value, key: &str) {
-    assert!(json[key].as_f64() > Some(0.0), "{key} is {}: {json}", json[key]);
+    assert_no_temporary_files(place);
 }
 
 #[test]
@@ -37,7 +27,7 @@ fn every_algorithm_with_every_policy_is_measured_beside_its_floor() {
             for key in
                 ["ms_per_update", "floor_ms", "ratio_to_floor", "updates_per_s", "peak_memory_mb"]
             {
-                positive(&json, key);
+                assert_positive(&json, key);
             }
             assert_eq!((&json["batch_size"], &json["threads"]), (&32.into(), &2.into()));
             assert_eq!((&json["algorithm"], &json["policy"]), (&algorithm.into(), &policy.into()));
@@ -45,7 +35,7 @@ fn every_algorithm_with_every_policy_is_measured_beside_its_floor() {
             assert!(json["peer_torch_ms"].is_null() && json.get("peer_jax_ms").is_some());
             let shares = &json["share_of_time"];
             for part in ["sample", "products", "optimiser"] {
-                positive(shares, part);
+                assert_positive(shares, part);
             }
         }
     }

@@ -1,24 +1,16 @@
-//! `dmprl bench scale` with few synthetic workers, too short for meaningful figures.
+//! `dmprl bench scale` with few synthetic workers.
 
-use std::process::Command;
-
-use dmprl_tests::program::{Running, Workplace, executable, processes_naming, until};
+use dmprl_tests::program::{Running, Workplace, processes_naming, until};
 use rustix::process::{Pid, Signal};
-use serde_json::Value;
 
-/// Starts a benchmark with its temporary files in the test's folder.
+use super::{SMALL, assert_no_shared_memory, assert_no_temporary_files, assert_positive, start};
+
 fn bench(place: &Workplace, more: &[&str]) -> Running {
-    let temporary = place.path("tmp");
-    std::fs::create_dir_all(&temporary).unwrap();
-    let mut command = Command::new(executable());
-    command.args(["bench", "scale", "--synthetic-workers", "8", "--feeders", "2"]);
-    command.args(["--cost-seconds", "0.2", "--check-seconds", "0.2", "--envs-per-worker", "2"]);
-    command.args(["--set", "policy.hidden=[16]", "--set", "algorithm.critic_hidden=[16]"]);
-    command.args(["--set", "algorithm.batch_size=16", "--set", "exploration.warm_up_steps=200"]);
+    let few = ["scale", "--synthetic-workers", "8", "--feeders", "2", "--envs-per-worker", "2"];
+    let short = ["--cost-seconds", "0.2", "--check-seconds", "0.2"];
     // A small replay fills at once.
-    command.args(["--set", "replay.capacity_steps=5000"]).args(more);
-    command.env("TMPDIR", temporary);
-    place.start_command(command)
+    let replay = ["--set", "replay.capacity_steps=5000"];
+    start(place, &[&few[..], &short, &SMALL, &replay, more].concat())
 }
 
 fn feeders(benchmark: Pid) -> usize {
@@ -29,16 +21,8 @@ fn feeders(benchmark: Pid) -> usize {
 fn assert_nothing_left(place: &Workplace, benchmark: Pid) {
     until("no feeder", || feeders(benchmark) == 0);
     place.assert_no_process();
-    let end = format!("-{}", benchmark.as_raw_nonzero());
-    let mut left = dmprl_tests::program::shared_memory_named(&end);
-    // A longer number would have the same beginning.
-    left.retain(|path| path.to_string_lossy().ends_with(&end));
-    assert_eq!(left, Vec::<std::path::PathBuf>::new());
-    assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
-}
-
-fn positive(json: &Value, key: &str) {
-    assert!(json[key].as_f64() > Some(0.0), "{key} is {}: {json}", json[key]);
+    assert_no_shared_memory(benchmark);
+    assert_no_temporary_files(place);
 }
 
 #[test]
@@ -48,7 +32,7 @@ fn ingest_loses_nothing_the_model_has_its_rows_and_a_real_system_stands_beside_i
     let id = running.id();
     let json = running.wait().with_status(0).json();
     for key in ["segments_per_s", "jain_index", "rss_start_mb", "rss_end_mb", "received"] {
-        positive(&json, key);
+        assert_positive(&json, key);
     }
     assert_eq!((&json["segment_bytes"], &json["workers"]), (&1_024.into(), &8.into()));
     for fault in ["lost", "duplicate", "rejected"] {
@@ -57,13 +41,13 @@ fn ingest_loses_nothing_the_model_has_its_rows_and_a_real_system_stands_beside_i
     // Not tested: fairness on a loaded machine.
     assert!(json["share_min"].as_f64() <= Some(1.0) && json["share_max"].as_f64() >= Some(1.0));
     for cost in ["worker_us", "insert_us", "ingest_us", "update_us", "update_cpu_us"] {
-        positive(&json["costs"], cost);
+        assert_positive(&json["costs"], cost);
     }
     let rows = json["model"].as_array().unwrap();
     let workers: Vec<_> = rows.iter().map(|row| row["workers"].as_u64().unwrap()).collect();
     assert_eq!(workers, [16, 32, 64, 128, 256, 512, 1_024]);
     for row in rows {
-        positive(row, "steps_per_s");
+        assert_positive(row, "steps_per_s");
         assert!(row["bottleneck"].is_string() && row["hosts"].as_u64() > Some(1), "{row}");
         assert!(row["learner_utilisation"].as_f64() <= Some(1.0 + 1e-9), "{row}");
     }
@@ -71,7 +55,7 @@ fn ingest_loses_nothing_the_model_has_its_rows_and_a_real_system_stands_beside_i
     let checks = json["check"].as_array().unwrap();
     assert_eq!(checks.len(), 1, "{json}");
     for key in ["predicted_steps_per_s", "measured_steps_per_s", "ratio", "cpu_ratio"] {
-        positive(&checks[0], key);
+        assert_positive(&checks[0], key);
     }
     assert_nothing_left(&place, id);
 }

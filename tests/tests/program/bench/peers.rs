@@ -1,9 +1,10 @@
 //! `dmprl bench peers` with real trainings, and a script in place of the other libraries.
 
 use std::os::unix::fs::PermissionsExt;
-use std::process::Command;
 
-use dmprl_tests::program::{Running, Workplace, executable};
+use dmprl_tests::program::{Running, Workplace};
+
+use super::{assert_no_temporary_files, start};
 
 /// Answers as `tests/peers/agent_peer.py` does, with the batch size of its settings as description.
 const PEER: &str = r#"#!/bin/sh
@@ -13,14 +14,10 @@ echo '{"ended": true, "env_steps": 100, "value": -3.0, "start_s": 0.5, "evaluati
 "#;
 
 fn bench(place: &Workplace, peer_python: &str, more: &[&str]) -> Running {
-    let temporary = place.path("tmp");
-    std::fs::create_dir(&temporary).unwrap();
-    let mut command = Command::new(executable());
-    command.args(["bench", "peers", "--task", "Pendulum-v1", "--peer-python", peer_python]);
-    command.args(["--workers", "1", "--set", "policy.hidden=[16]"]);
-    command.args(["--set", "evaluation.interval_steps=500", "--set", "evaluation.episodes=2"]);
-    command.args(more).env("TMPDIR", temporary);
-    place.start_command(command)
+    let python = ["peers", "--task", "Pendulum-v1", "--peer-python", peer_python];
+    let small = ["--workers", "1", "--set", "policy.hidden=[16]"];
+    let often = ["--set", "evaluation.interval_steps=500", "--set", "evaluation.episodes=2"];
+    start(place, &[&python[..], &small, &often, more].concat())
 }
 
 /// Returns the path of an interpreter that runs `PEER` instead of a script.
@@ -50,7 +47,7 @@ fn each_seed_is_trained_until_the_target_by_all() {
     assert_eq!(json["target"]["value"], -1e6, "{json}");
     assert!(json["candidates"]["sbx-sac"]["ratio"].as_f64() < Some(1.0), "{json}");
     place.assert_no_process();
-    assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
+    assert_no_temporary_files(&place);
 }
 
 #[test]

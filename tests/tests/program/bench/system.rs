@@ -1,32 +1,20 @@
-//! `dmprl bench system` with a real run, too short for meaningful figures.
+//! `dmprl bench system` with a real run.
 
-use std::process::Command;
-
-use dmprl_tests::program::{Running, Workplace, executable};
+use dmprl_tests::program::{Running, Workplace};
 use rustix::process::Signal;
-use serde_json::Value;
 
-/// Starts a benchmark with its temporary files, including the run, in the test's folder.
+use super::{SMALL, assert_no_temporary_files, assert_positive, start};
+
 fn bench(place: &Workplace, more: &[&str]) -> Running {
-    let temporary = place.path("tmp");
-    std::fs::create_dir_all(&temporary).unwrap();
-    let mut command = Command::new(executable());
-    command.args(["bench", "system", "--task", "reacher", "--envs-per-worker", "2"]);
-    command.args(["--set", "policy.hidden=[16]", "--set", "algorithm.critic_hidden=[16]"]);
-    command.args(["--set", "algorithm.batch_size=16", "--set", "exploration.warm_up_steps=200"]);
-    command.args(["--set", "metrics.interval_steps=50"]).args(more);
-    command.env("TMPDIR", temporary);
-    place.start_command(command)
+    let few = ["system", "--task", "reacher", "--envs-per-worker", "2"];
+    let metrics = ["--set", "metrics.interval_steps=50"];
+    start(place, &[&few[..], &SMALL, &metrics, more].concat())
 }
 
 /// The run's supervisor has its own session, so the benchmark waits for it.
 fn assert_nothing_left(place: &Workplace) {
     place.assert_no_process();
-    assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
-}
-
-fn positive(json: &Value, key: &str) {
-    assert!(json[key].as_f64() > Some(0.0), "{key} is {}: {json}", json[key]);
+    assert_no_temporary_files(place);
 }
 
 #[test]
@@ -35,7 +23,7 @@ fn a_whole_run_is_measured_after_its_warm_up_and_leaves_nothing() {
     let more = ["--workers", "2", "--seconds", "0.5", "--json"];
     let json = bench(&place, &more).wait().with_status(0).json();
     for key in ["env_steps_per_s", "updates_per_s", "samples_per_insert", "wall_s"] {
-        positive(&json, key);
+        assert_positive(&json, key);
     }
     assert!(json["wall_s"].as_f64() >= Some(0.5), "{json}");
     // Both kinds of lag are present, and no median exceeds its maximum.
@@ -46,7 +34,7 @@ fn a_whole_run_is_measured_after_its_warm_up_and_leaves_nothing() {
     assert_eq!(json["updates_per_segment_asked"], 2.0);
     let measured = json["updates_per_segment"].as_f64().unwrap();
     assert!((0.5..4.0).contains(&measured), "{json}");
-    positive(&json["cpu_s"], "learner");
+    assert_positive(&json["cpu_s"], "learner");
     assert_eq!((&json["lost"], &json["rejected"]), (&0.into(), &0.into()), "{json}");
     assert_eq!((&json["workers"], &json["envs_per_worker"]), (&2.into(), &2.into()));
     assert_nothing_left(&place);

@@ -1,34 +1,20 @@
-//! `dmprl bench rollout` with real workers and peers, in rounds too short for meaningful figures.
+//! `dmprl bench rollout` with real workers and peers.
 
-use std::process::Command;
+use dmprl_tests::program::{Running, Workplace};
+use rustix::process::{Pid, Signal};
 
-use dmprl_tests::program::{Running, Workplace, executable, shared_memory_named};
-use rustix::process::Signal;
-use serde_json::Value;
+use super::{assert_no_shared_memory, assert_no_temporary_files, assert_positive, start};
 
-/// Starts a benchmark with its temporary files in the test's folder.
 fn bench(place: &Workplace, task: &str, more: &[&str]) -> Running {
-    let temporary = place.path("tmp");
-    std::fs::create_dir(&temporary).unwrap();
-    let mut command = Command::new(executable());
-    command.args(["bench", "rollout", "--task", task, "--envs-per-worker", "2"]);
-    command.args(["--set", "policy.hidden=[16]", "--seconds", "0.3"]).args(more);
-    command.env("TMPDIR", temporary);
-    place.start_command(command)
+    let few = ["rollout", "--task", task, "--envs-per-worker", "2"];
+    let small = ["--set", "policy.hidden=[16]", "--seconds", "0.3"];
+    start(place, &[&few[..], &small, more].concat())
 }
 
-fn assert_nothing_left(place: &Workplace, process: rustix::process::Pid) {
+fn assert_nothing_left(place: &Workplace, process: Pid) {
     place.assert_no_process();
-    let end = format!("-{}", process.as_raw_nonzero());
-    let mut left = shared_memory_named(&end);
-    // A longer number would have the same beginning.
-    left.retain(|path| path.to_string_lossy().ends_with(&end));
-    assert_eq!(left, Vec::<std::path::PathBuf>::new());
-    assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
-}
-
-fn positive(json: &Value, key: &str) {
-    assert!(json[key].as_f64() > Some(0.0), "{key} is {}: {json}", json[key]);
+    assert_no_shared_memory(process);
+    assert_no_temporary_files(place);
 }
 
 #[test]
@@ -38,12 +24,12 @@ fn a_task_on_the_batch_is_measured_beside_its_ceiling_and_gymnasium() {
     let id = running.id();
     let json = running.wait().with_status(0).json();
     for key in ["mujoco", "ceiling", "worker", "one_worker", "gymnasium"] {
-        positive(&json, &format!("{key}_steps_per_s"));
+        assert_positive(&json, &format!("{key}_steps_per_s"));
         assert_eq!(json["rounds"][key].as_array().unwrap().len(), 2, "{json}");
         assert!(json["cpu_us_per_step"][key].as_f64() > Some(0.0), "{json}");
     }
     for key in ["worker_to_ceiling", "worker_to_gymnasium", "first_segment_s", "worker_rss_mb"] {
-        positive(&json, key);
+        assert_positive(&json, key);
     }
     // With EnvPool in .venv there is a figure, otherwise null and the reason.
     let envpool = json.get("envpool_steps_per_s").unwrap();
@@ -81,7 +67,7 @@ fn a_segment_env_of_ones_own_is_measured_alone() {
     let running =
         bench(&place, "tiny_envs:Timed", &[&more[..], &[folder.to_str().unwrap()]].concat());
     let json = running.wait().with_status(0).json();
-    positive(&json, "worker_steps_per_s");
+    assert_positive(&json, "worker_steps_per_s");
     for absent in ["mujoco", "ceiling", "gymnasium", "envpool", "panda_gym"] {
         assert!(json[format!("{absent}_steps_per_s")].is_null(), "{json}");
         assert!(json["notes"][absent].is_string(), "{json}");
@@ -109,7 +95,7 @@ fn a_gymnasium_class_of_ones_own_is_measured_beside_gymnasiums_loop() {
     let running =
         bench(&place, "tiny_envs:Limited", &[&more[..], &[folder.to_str().unwrap()]].concat());
     let json = running.wait().with_status(0).json();
-    positive(&json, "worker_to_gymnasium");
+    assert_positive(&json, "worker_to_gymnasium");
 }
 
 /// The remaining parts are measured.
@@ -123,9 +109,8 @@ fn an_interpreter_of_peers_that_is_none_makes_them_absent_with_its_last_word() {
     for (mode, words) in [(0o600, "cannot start"), (0o700, "exit status 3, no python here")] {
         let permissions = std::os::unix::fs::PermissionsExt::from_mode(mode);
         std::fs::set_permissions(&interpreter, permissions).unwrap();
-        let _ = std::fs::remove_dir(place.path("tmp"));
         let json = bench(&place, "panda-reach", &more).wait().with_status(0).json();
-        positive(&json, "worker_to_ceiling");
+        assert_positive(&json, "worker_to_ceiling");
         for peer in ["envpool", "panda_gym"] {
             assert!(json[format!("worker_to_{peer}")].is_null(), "{json}");
             let note = json["notes"][peer].as_str().unwrap();

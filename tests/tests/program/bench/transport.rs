@@ -1,21 +1,12 @@
-//! `dmprl bench transport` with real processes, in rounds too short for meaningful figures.
+//! `dmprl bench transport` with real processes.
 
-use std::process::Command;
-
-use dmprl_tests::program::{
-    Running, Workplace, executable, processes_naming, shared_memory_named, until,
-};
+use dmprl_tests::program::{Running, Workplace, processes_naming, until};
 use rustix::process::{Pid, Signal};
-use serde_json::Value;
 
-/// Starts a benchmark with its temporary files in the test's folder.
+use super::{assert_no_shared_memory, assert_no_temporary_files, assert_positive, start};
+
 fn bench(place: &Workplace, more: &[&str]) -> Running {
-    let temporary = place.path("tmp");
-    std::fs::create_dir_all(&temporary).unwrap();
-    let mut command = Command::new(executable());
-    command.args(["bench", "transport", "--seconds", "0.05"]).args(more);
-    command.env("TMPDIR", temporary);
-    place.start_command(command)
+    start(place, &[&["transport", "--seconds", "0.05"], more].concat())
 }
 
 /// Returns the processes of a benchmark. Each names the shared memory, which names the benchmark,
@@ -32,16 +23,8 @@ fn is_alone(place: &Workplace, benchmark: Pid) -> bool {
 /// The sender of a Python peer checks twenty times a second whether its receiver is alive.
 fn until_nothing_left(place: &Workplace, benchmark: Pid) {
     until("no process", || is_alone(place, benchmark));
-    let end = format!("-{}", benchmark.as_raw_nonzero());
-    let mut left = shared_memory_named(&end);
-    // A longer number would have the same beginning.
-    left.retain(|path| path.to_string_lossy().ends_with(&end));
-    assert_eq!(left, Vec::<std::path::PathBuf>::new());
-    assert_eq!(std::fs::read_dir(place.path("tmp")).unwrap().count(), 0, "temporary files");
-}
-
-fn positive(json: &Value, key: &str) {
-    assert!(json[key].as_f64() > Some(0.0), "{key} is {}: {json}", json[key]);
+    assert_no_shared_memory(benchmark);
+    assert_no_temporary_files(place);
 }
 
 #[test]
@@ -57,15 +40,15 @@ fn nothing_is_lost_and_nothing_comes_twice_whatever_the_size() {
     let bytes: Vec<_> = sizes.iter().map(|size| &size["segment_bytes"]).collect();
     assert_eq!(bytes, [1_024, 10_240]);
     for size in sizes {
-        positive(size, "segments_per_s");
+        assert_positive(size, "segments_per_s");
         assert!(size["received"].as_u64() > Some(512), "{json}");
         for fault in ["lost", "duplicate", "rejected"] {
             assert_eq!(size[fault], 0, "{json}");
         }
         assert_eq!(size["rounds"].as_array().unwrap().len(), 3, "{json}");
         for peer in ["pipe", "unix_socket", "multiprocessing_queue"] {
-            positive(&size["peers"], peer);
-            positive(&size["to_peers"], peer);
+            assert_positive(&size["peers"], peer);
+            assert_positive(&size["to_peers"], peer);
         }
     }
     assert_eq!(json["peers"], sizes[0]["peers"]);
@@ -86,7 +69,7 @@ fn at_level_log_nothing_is_lost_either_and_no_log_stays() {
     let json = running.wait().with_status(0).json();
     assert_eq!(json["level"], "log");
     for size in json["sizes"].as_array().unwrap() {
-        positive(size, "segments_per_s");
+        assert_positive(size, "segments_per_s");
         for fault in ["lost", "duplicate", "rejected"] {
             assert_eq!(size[fault], 0, "{json}");
         }
