@@ -49,7 +49,8 @@ class Critics:
             return _layers(networks(f"{name}.network"), [inputs, *hidden, outputs])
 
         self.model = layers("outcome_model", model_inputs, self.steps * goal)
-        self.critics = [layers(f"critic_{index}", model_inputs + features, 1) for index in (1, 2)]
+        inputs = model_inputs + features
+        self.critics = [layers(f"critic_{index}", inputs, 1) for index in (1, 2)]
 
     def values(self, observation: np.ndarray, segments: np.ndarray) -> np.ndarray:
         """Returns the values, (N,), of segments, (N, K, A), from an observation, (O,)."""
@@ -84,19 +85,29 @@ def _read(path: Path) -> Callable[[str], np.ndarray]:
 
 
 def _layers(flat: np.ndarray, widths: list[int]) -> list:
+    """Returns weights and biases of all layers, and gain and shift of the hidden ones if any."""
     layers, at = [], 0
     for inputs, outputs in itertools.pairwise(widths):
         weights = flat[at : at + inputs * outputs].reshape(outputs, inputs)
         at += inputs * outputs
-        layers.append((weights, flat[at : at + outputs]))
+        layers.append((weights, flat[at : at + outputs], None))
         at += outputs
+    if at < len(flat):
+        for index, width in enumerate(widths[1:-1]):
+            gain_shift = flat[at : at + 2 * width].reshape(2, width)
+            layers[index] = (*layers[index][:2], gain_shift)
+            at += 2 * width
     return layers
 
 
 def _forward(layers: list, x: np.ndarray) -> np.ndarray:
-    for weights, bias in layers[:-1]:
-        x = np.maximum(x @ weights.T + bias, 0.0)
-    weights, bias = layers[-1]
+    for weights, bias, gain_shift in layers[:-1]:
+        x = x @ weights.T + bias
+        if gain_shift is not None:
+            x = (x - x.mean(1, keepdims=True)) / np.sqrt(x.var(1, keepdims=True) + 1e-5)
+            x = x * gain_shift[0] + gain_shift[1]
+        x = np.maximum(x, 0.0)
+    weights, bias, _ = layers[-1]
     return x @ weights.T + bias
 
 
