@@ -14,6 +14,8 @@ const OURS: &str = "ours";
 /// All trainings of each candidate, ours first.
 #[derive(Debug, Clone)]
 pub struct Figures {
+    /// Whether the user stopped the benchmark before its end.
+    pub interrupted: bool,
     config: ExperimentConfig,
     equal_settings: bool,
     machine: Machine,
@@ -55,6 +57,7 @@ impl Figures {
         let kinds = std::iter::once(None).chain(bench.peers.iter().copied().map(Some));
         let candidate = |kind| Candidate { kind, trainings: Vec::new(), note: None };
         Self {
+            interrupted: false,
             config: bench.config.clone(),
             equal_settings: bench.equal_settings,
             machine,
@@ -88,6 +91,10 @@ impl Figures {
         if let Some(candidate) = self.candidates.iter_mut().find(|it| it.kind == Some(kind)) {
             candidate.note = Some(text);
         }
+    }
+
+    pub(super) fn has_trainings(&self) -> bool {
+        self.candidates.iter().any(|candidate| !candidate.trainings.is_empty())
     }
 
     fn ours_s(&self) -> Option<f64> {
@@ -132,6 +139,7 @@ impl Figures {
             "max_minutes": self.config.run.max_minutes,
             "steps_max": self.config.run.steps,
             "equal_settings": self.equal_settings,
+            "interrupted": self.interrupted,
             "candidates": candidates,
             "cpu": self.machine.cpu,
             "cores": self.machine.cores,
@@ -162,10 +170,9 @@ impl Figures {
         ];
         for candidate in &self.candidates {
             lines.push(match &candidate.note {
-                Some(why) if candidate.trainings.is_empty() => {
-                    format!("  {:<12}absent: {why}", candidate.name())
-                }
-                _ => self.row(candidate),
+                _ if !candidate.trainings.is_empty() => self.row(candidate),
+                Some(why) => format!("  {:<12}absent: {why}", candidate.name()),
+                None => format!("  {:<12}not trained", candidate.name()),
             });
         }
         lines.extend([

@@ -80,23 +80,31 @@ struct Training {
     value: Option<f64>,
 }
 
-/// Runs the benchmark; returns `None` if the user interrupted it. Removes all its processes and
-/// files.
+/// Runs the benchmark. If the user interrupts it, returns what has been trained, or `None` if
+/// nothing has. Removes all its processes and files.
 ///
 /// # Errors
 /// One of our trainings fails.
 pub fn agents(bench: &AgentsBench, progress: &dyn Progress) -> anyhow::Result<Option<Figures>> {
     let watch = Watch::start()?;
-    match measure(bench, &watch, progress) {
-        Err(error) if error.is::<Interrupted>() => Ok(None),
-        result => result.map(Some),
+    let mut figures = Figures::new(bench, Manifest::new(None)?.machine);
+    match measure(bench, &watch, progress, &mut figures) {
+        Err(error) if error.is::<Interrupted>() => {
+            figures.interrupted = true;
+            Ok(figures.has_trainings().then_some(figures))
+        }
+        result => result.map(|()| Some(figures)),
     }
 }
 
-fn measure(bench: &AgentsBench, watch: &Watch, progress: &dyn Progress) -> anyhow::Result<Figures> {
+fn measure(
+    bench: &AgentsBench,
+    watch: &Watch,
+    progress: &dyn Progress,
+    figures: &mut Figures,
+) -> anyhow::Result<()> {
     let folder = tempfile::Builder::new().prefix("dmprl-bench-").tempdir();
     let folder = folder.context("cannot make a folder for the trainings")?;
-    let mut figures = Figures::new(bench, Manifest::new(None)?.machine);
     for round in 0..bench.seeds {
         announce_round(progress, round as usize, bench.seeds as usize);
         let mut config = bench.config.clone();
@@ -120,7 +128,7 @@ fn measure(bench: &AgentsBench, watch: &Watch, progress: &dyn Progress) -> anyho
             }
         }
     }
-    Ok(figures)
+    Ok(())
 }
 
 /// Maximum time of a training, until it counts as hanging.

@@ -21,7 +21,7 @@ its end. A peer has one environment, the CPU, and its library's default settings
 noise of 0.1; sb3-tqc-her: the RL Zoo's), or ours with --equal-settings. All have the same number of
 steps before the first update, and the same interval, episodes and seeds of evaluations.
 Without --peer-python, the peers' packages are installed into .venv-peers on first use.
-Ctrl-C stops the benchmark and removes its processes and trainings.
+Ctrl-C stops the benchmark, removes its processes, and reports the trainings that have ended.
 
 EXAMPLES
   dmprl bench peers --task reacher --until-return -5.2 --preset fast
@@ -120,5 +120,5 @@ pub(super) fn run(args: &PeersArgs) -> anyhow::Result<Outcome> {
         return Ok(Outcome::Interrupted);
     };
     emit(&if args.json { figures.json().to_string() } else { figures.text() })?;
-    Ok(Outcome::Done)
+    Ok(if figures.interrupted { Outcome::Interrupted } else { Outcome::Done })
 }

@@ -3,6 +3,7 @@
 use std::os::unix::fs::PermissionsExt;
 
 use dmprl_tests::program::{Running, Workplace};
+use rustix::process::Signal;
 
 use super::{assert_no_temporary_files, start};
 
@@ -46,6 +47,25 @@ fn each_seed_is_trained_until_the_target_by_all() {
     }
     assert_eq!(json["target"]["value"], -1e6, "{json}");
     assert!(json["candidates"]["sbx-sac"]["ratio"].as_f64() < Some(1.0), "{json}");
+    place.assert_no_process();
+    assert_no_temporary_files(&place);
+}
+
+#[test]
+fn ctrl_c_reports_the_trainings_that_have_ended() {
+    let place = Workplace::new();
+    let python = place.path("python");
+    std::fs::write(&python, "#!/bin/sh\necho '{\"ready\": \"waits\"}'\nexec sleep 600\n").unwrap();
+    std::fs::set_permissions(&python, PermissionsExt::from_mode(0o700)).unwrap();
+    let target = ["--until-return", "-1e6", "--seeds", "2", "--peer", "sb3-sac", "--json"];
+    let mut running = bench(&place, &python, &target);
+    running.until_said("ours: return");
+    running.signal_group(Signal::INT);
+    let json = running.wait().with_status(130).json();
+    assert_eq!(json["interrupted"], true, "{json}");
+    let trained =
+        |name: &str| json["candidates"][name]["trainings"].as_array().map(|them| them.len());
+    assert_eq!((trained("ours"), trained("sb3-sac")), (Some(1), Some(0)), "{json}");
     place.assert_no_process();
     assert_no_temporary_files(&place);
 }
