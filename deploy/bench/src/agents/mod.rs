@@ -80,8 +80,8 @@ struct Training {
     value: Option<f64>,
 }
 
-/// Runs the benchmark. If the user interrupts it, returns what has been trained, or `None` if
-/// nothing has. Removes all its processes and files.
+/// Runs the benchmark. If the user interrupts it, returns the trainings that have ended, or `None`
+/// if none has. Removes all its processes and files.
 ///
 /// # Errors
 /// One of our trainings fails.
