@@ -23,7 +23,7 @@ impl Process {
     /// because a thread first ends its system call, such as the renaming of a checkpoint.
     ///
     /// # Panics
-    /// If a thread still runs after [`PATIENCE`].
+    /// If a thread still runs after [`PATIENCE`](crate::waiting::PATIENCE).
     pub fn signal(&self, signal: Signal) {
         let _ = kill_process(self.id, signal);
         if signal == Signal::STOP {
