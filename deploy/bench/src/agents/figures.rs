@@ -162,7 +162,8 @@ impl Figures {
                 self.machine.cpu.as_deref().unwrap_or("unknown processor"),
                 self.machine.cores
             ),
-            String::new(),
+            if self.interrupted { "interrupted: only the trainings that had ended" } else { "" }
+                .to_owned(),
             format!(
                 "  {:<12}{:>8}  {:>8}  {:<17}{:>9}{:>8}{:>8}{:>8}",
                 "", "reached", "time s", "(range)", "steps", "start", "eval", "ratio"
