@@ -37,6 +37,16 @@ def follow(axis: int, action: float) -> float:
     return float((end[HAND] - start[HAND])[axis] / (4 * 0.05 * action))
 
 
+def reach() -> float:
+    """Returns the part of 3 cm along x that panda-gym's inverse kinematics makes."""
+    env.reset(seed=1)
+    start = env.robot.get_ee_position().copy()
+    target = start + np.array([0.03, 0.0, 0.0])
+    down = np.array([1.0, 0.0, 0.0, 0.0])
+    env.robot.set_joint_angles(env.robot.inverse_kinematics(env.robot.ee_link, target, down))
+    return float((env.robot.get_ee_position() - start)[0] / 0.03)
+
+
 def strike(action: float, gap: float, seed: int) -> float:
     """Returns the puck's greatest speed [m/s]."""
     state = env.reset(seed=seed)[0]["observation"]
@@ -51,6 +61,8 @@ def strike(action: float, gap: float, seed: int) -> float:
 
 
 print("program,measure,action,gap_m,value")
+if name == "panda-gym":
+    print(f"{name},part of 3 cm along x by its inverse kinematics,,,{reach():.2f}")
 for axis in range(3):
     for action in (0.2, 0.6):
         part = follow(axis, action)

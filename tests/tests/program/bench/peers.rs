@@ -57,15 +57,20 @@ fn ctrl_c_reports_the_trainings_that_have_ended() {
     let python = place.path("python");
     std::fs::write(&python, "#!/bin/sh\necho '{\"ready\": \"waits\"}'\nexec sleep 600\n").unwrap();
     std::fs::set_permissions(&python, PermissionsExt::from_mode(0o700)).unwrap();
-    let target = ["--until-return", "-1e6", "--seeds", "2", "--peer", "sb3-sac", "--json"];
-    let mut running = bench(&place, &python, &target);
-    running.until_said("ours: return");
-    running.signal_group(Signal::INT);
-    let json = running.wait().with_status(130).json();
+    let target = ["--until-return", "-1e6", "--seeds", "2", "--peer", "sb3-sac"];
+    let interrupted = |output: &[&str]| {
+        let mut running = bench(&place, &python, &[&target, output].concat());
+        running.until_said("ours: return");
+        running.signal_group(Signal::INT);
+        running.wait().with_status(130)
+    };
+    let json = interrupted(&["--json"]).json();
     assert_eq!(json["interrupted"], true, "{json}");
     let trained =
         |name: &str| json["candidates"][name]["trainings"].as_array().map(|them| them.len());
     assert_eq!((trained("ours"), trained("sb3-sac")), (Some(1), Some(0)), "{json}");
+    let table = interrupted(&[]).printed;
+    assert!(table.contains("\ninterrupted: only the trainings that had ended\n"), "{table}");
     place.assert_no_process();
     assert_no_temporary_files(&place);
 }
