@@ -33,8 +33,8 @@ pub fn interpreter(venv: &Path, config: &ExperimentConfig) -> Result<Interpreter
     Interpreter::start(&InterpreterOptions { venv: venv.to_owned(), python_path })
 }
 
-/// Creates `count` environments of the run's task and watches every call into them. With hindsight,
-/// it also looks for their goal rule.
+/// Creates `count` environments of the run's task, which execute `steps` at a call, and watches
+/// every call into them. With hindsight, it also looks for their goal rule.
 ///
 /// # Errors
 /// If the environments cannot be created, the watchdog cannot be started, or hindsight is
@@ -43,9 +43,9 @@ pub fn make(
     interpreter: &Interpreter,
     config: &ExperimentConfig,
     count: usize,
+    steps: usize,
     on_hang: impl FnOnce(String) + Send + 'static,
 ) -> Result<PythonEnvironments, EnvironmentsError> {
-    let steps = config.policy.decision_steps();
     let mut environments = PythonEnvironments::start(interpreter, &config.task, count, steps)?;
     watch(&environments, config, on_hang)?;
     if config.replay.hindsight != Hindsight::None {

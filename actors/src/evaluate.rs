@@ -32,7 +32,7 @@ pub struct Episodes<'a> {
     pub count: usize,
     /// Episode i is reset with seed `first_seed + i`.
     pub first_seed: u64,
-    /// Aborts the evaluation. Checked before each segment, because slow episodes take minutes.
+    /// Aborts the evaluation. Checked before each decision, because slow episodes take minutes.
     pub stop: &'a AtomicBool,
 }
 
@@ -65,7 +65,7 @@ pub struct Evaluator {
     faults: Faults,
     envs: usize,
     trace: Option<Trace>,
-    /// Called after each segment with the number of steps of the traced episode.
+    /// Called after each decision's steps with the number of steps of the traced episode.
     on_steps: Box<dyn FnMut(usize)>,
 }
 
@@ -102,7 +102,7 @@ impl Evaluator {
         let faults = Faults::new(envs, u32::MAX);
         Ok(Self {
             environments,
-            runner: PolicyRunner::new(policy, envs),
+            runner: PolicyRunner::without_exploration(policy, envs),
             faults,
             envs,
             trace: None,
@@ -111,7 +111,7 @@ impl Evaluator {
     }
 
     /// Creates an evaluator for a single environment that records each step of an episode.
-    /// `on_steps` is called after each segment with the number of steps so far.
+    /// `on_steps` is called after each decision's steps with the number of steps so far.
     ///
     /// The network still processes as many rows as in an evaluation. With a single row, matrix
     /// products are rounded differently, and chaotic dynamics such as a bouncing ball amplify the
@@ -197,9 +197,8 @@ impl Evaluator {
         &mut self,
         Episodes { count, first_seed, stop }: Episodes<'_>,
     ) -> Result<Option<Wave>, RolloutError> {
-        let layout = self.runner.policy.layout();
-        let dims = layout.action_len;
-        let actions_len = self.envs * layout.segment_steps * dims;
+        let dims = self.runner.policy.layout().action_len;
+        let actions_len = self.envs * self.runner.steps() * dims;
         let mut wave = Wave {
             returns: vec![0.0; self.envs],
             success: vec![SUCCESS_NOT_REPORTED; self.envs],
@@ -229,7 +228,7 @@ impl Evaluator {
             let failed = self.faults.inspect_segment(&mut self.environments)?;
             for env in 0..self.envs {
                 if wave.running[env] && !self.faults.failed()[env] {
-                    self.add_segment(&mut wave, env);
+                    self.add_steps(&mut wave, env);
                 }
             }
             if failed {
@@ -265,16 +264,15 @@ impl Evaluator {
         Ok(self.faults.inspect_reset(&mut self.environments, &mask)?)
     }
 
-    /// Adds environment `env`'s segment to the sums.
-    fn add_segment(&mut self, wave: &mut Wave, env: usize) {
-        let layout = self.runner.policy.layout();
-        let (k_max, dims) = (layout.segment_steps, layout.action_len);
+    /// Adds the steps that environment `env` has executed to the sums.
+    fn add_steps(&mut self, wave: &mut Wave, env: usize) {
+        let (k_max, dims) = (self.runner.steps(), self.runner.policy.layout().action_len);
         let steps = self.environments.steps()[env] as usize;
         let rewards = &self.environments.rewards()[env * k_max..][..steps];
         wave.returns[env] += rewards.iter().sum::<f64>();
         let u = &self.runner.u[env * k_max * dims..][..steps * dims];
         if let Some(trace) = &mut self.trace {
-            trace.add_segment(&self.environments, &self.runner);
+            trace.add_steps(&self.environments, &self.runner);
             (self.on_steps)(trace.rewards.len());
         }
         wave.actions[env] += u.len() as u64;

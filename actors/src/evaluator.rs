@@ -59,7 +59,8 @@ pub fn evaluator(
     on_hang: impl FnOnce(String) + Send + 'static,
 ) -> Result<Evaluator, EvaluationError> {
     let envs = config.evaluation.episodes.min(ENVIRONMENTS_MAX);
-    let environments = environments::make(interpreter, config, envs, on_hang)?;
+    let steps = config.policy.execution_steps();
+    let environments = environments::make(interpreter, config, envs, steps, on_hang)?;
     Ok(Evaluator::new(config, environments, envs)?)
 }
 

@@ -1,7 +1,7 @@
 //! Stage 3 of 8, decisions: runs a policy for E environments. Called by the rollout and the
 //! evaluator.
 
-use dmprl_shared::policy::{Head, LearnedStd, Policy, PolicyWorkspace, SmallBatchNetwork};
+use dmprl_shared::policy::{Head, LearnedStd, Plan, Policy, PolicyWorkspace, SmallBatchNetwork};
 
 use crate::python_env::PythonEnvironments;
 
@@ -15,24 +15,42 @@ pub struct PolicyRunner {
     pub work: PolicyWorkspace,
     /// Current observations, (E, O).
     pub observations: Vec<f32>,
-    /// Actions u of the segment with exploration, (E, K, A). They are in [-1, 1], unless they are
+    /// Actions u to execute, with exploration, (E, S, A). They are in [-1, 1], unless they are
     /// draws of a policy with an unbounded Gaussian.
     pub u: Vec<f32>,
+    /// Steps S that follow a decision: K, or 1 for an ensemble.
+    steps: usize,
+    /// Each environment's plan, (E,); empty unless the policy is executed as an ensemble.
+    plans: Vec<Plan>,
     /// Learned standard deviations of the policy, (A,); empty if they are not learned.
     pub std: Vec<f32>,
     /// (y, yd) at the start of each environment's segment, (E, 2A); empty if the policy has no
     /// such state.
     state: Vec<f32>,
-    /// The segment's actions in the environments' units, (E, K, A).
+    /// `u` in the environments' units, (E, S, A).
     actions: Vec<f64>,
 }
 
 impl PolicyRunner {
-    /// Creates a runner for `envs` environments, without parameters.
+    /// Creates a runner for `envs` environments that executes whole segments, without parameters.
     #[must_use]
     pub fn new(policy: Policy, envs: usize) -> Self {
+        let steps = policy.layout().segment_steps;
+        Self::with_plans(policy, envs, steps, Vec::new())
+    }
+
+    /// Creates a runner that executes segments as `policy.execution` states.
+    #[must_use]
+    pub fn without_exploration(policy: Policy, envs: usize) -> Self {
+        let (layout, config) = (policy.layout(), &policy.description().policy);
+        let steps = config.execution_steps();
+        let plans = vec![Plan::new(layout); if config.is_ensemble() { envs } else { 0 }];
+        Self::with_plans(policy, envs, steps, plans)
+    }
+
+    fn with_plans(policy: Policy, envs: usize, steps: usize, plans: Vec<Plan>) -> Self {
         let layout = policy.layout();
-        let actions_len = envs * layout.segment_steps * layout.action_len;
+        let actions_len = envs * steps * layout.action_len;
         Self {
             network: SmallBatchNetwork::new(policy.shape().clone()),
             work: policy.workspace(envs),
@@ -41,8 +59,16 @@ impl PolicyRunner {
             std: vec![0.0; policy.learned_std().map_or(0, LearnedStd::len)],
             state: vec![0.0; envs * policy.state_len()],
             actions: vec![0.0; actions_len],
+            steps,
+            plans,
             policy,
         }
+    }
+
+    /// Steps S that follow a decision: K, or 1 if each environment has a plan.
+    #[must_use]
+    pub fn steps(&self) -> usize {
+        self.steps
     }
 
     /// Copies the observations from the environments, in 32 bits.
@@ -80,10 +106,21 @@ impl PolicyRunner {
         self.take_u();
     }
 
-    /// Copies the actions to `u`, clipped to [-1, 1]: the mean of a Gaussian may be outside.
+    /// Copies the actions to `u`, clipped to [-1, 1]: the mean of a Gaussian may be outside. For an
+    /// ensemble they go through the plans.
     fn take_u(&mut self) {
-        for (u, action) in self.u.iter_mut().zip(&self.work.actions) {
-            *u = action.clamp(-1.0, 1.0);
+        if self.plans.is_empty() {
+            for (u, action) in self.u.iter_mut().zip(&self.work.actions) {
+                *u = action.clamp(-1.0, 1.0);
+            }
+            return;
+        }
+        let layout = self.policy.layout();
+        let segments = self.work.actions.chunks_exact(layout.actions_len());
+        let rows = self.u.chunks_exact_mut(layout.action_len);
+        for ((plan, segment), u) in self.plans.iter_mut().zip(segments).zip(rows) {
+            plan.add(segment);
+            u.copy_from_slice(plan.take().expect("a segment has been added"));
         }
     }
 
@@ -99,7 +136,7 @@ impl PolicyRunner {
         }
     }
 
-    /// Returns `u` in the environments' units, (E, K, A).
+    /// Returns `u` in the environments' units, (E, S, A).
     pub fn actions(&mut self) -> &[f64] {
         self.policy.scaling().apply(&self.u, &mut self.actions);
         &self.actions
@@ -111,8 +148,8 @@ impl PolicyRunner {
         &self.actions
     }
 
-    /// Advances `state`, (y, yd) of environment `env`, from after step `k` - 1 of the segment to
-    /// after step `k`. Step 0 is the start of the segment. Does nothing if the policy has no state.
+    /// Advances `state`, (y, yd) of environment `env`, from after step `k` - 1 of the decision to
+    /// after step `k`. Step 0 is its start. Does nothing if the policy has no state.
     pub fn advance_state(&self, env: usize, k: usize, state: &mut [f32]) {
         let layout = self.policy.layout();
         if let Some(commands) = self.policy.command_state() {
@@ -120,7 +157,7 @@ impl PolicyRunner {
                 let len = state.len();
                 state.copy_from_slice(&self.state[env * len..(env + 1) * len]);
             } else {
-                let first = (env * layout.segment_steps + k - 1) * layout.action_len;
+                let first = (env * self.steps + k - 1) * layout.action_len;
                 commands.follow(&self.u[first..first + layout.action_len], state);
             }
         } else if self.policy.carries_dmp_state()
@@ -130,9 +167,12 @@ impl PolicyRunner {
         }
     }
 
-    /// Sets the state from which environment `env`'s next segment starts: the one at the segment's
-    /// end, or zero if the episode has ended.
+    /// Sets the state from which environment `env`'s next segment starts: the one after the last
+    /// step, or zero if the episode has ended. Then its plan is dropped, too.
     pub fn next_state(&mut self, env: usize, ended: bool) {
+        if let Some(plan) = self.plans.get_mut(env).filter(|_| ended) {
+            plan.clear();
+        }
         let len = self.policy.state_len();
         if len == 0 {
             return;
@@ -142,7 +182,7 @@ impl PolicyRunner {
         if ended {
             state.fill(0.0);
         } else {
-            for k in 1..=self.policy.layout().segment_steps {
+            for k in 1..=self.steps {
                 self.advance_state(env, k, state);
             }
         }

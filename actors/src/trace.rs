@@ -16,7 +16,7 @@ pub struct Trace {
     pub observations: Vec<f64>,
     /// Actions in the environment's units, (T, A).
     pub actions: Vec<f64>,
-    /// Segments in order.
+    /// Segments in order; an ensemble has one for each step.
     pub segments: Vec<TracedSegment>,
 }
 
@@ -25,15 +25,15 @@ pub struct Trace {
 pub struct TracedSegment {
     /// Number of steps of the episode before it.
     pub first_step: usize,
-    /// Number of its steps; the last segment of an episode may end early.
+    /// Number of its steps; the last segment of an episode may end early. For an ensemble it is 1.
     pub steps: usize,
     /// Primitives that the policy chose; `None` if it has none.
     pub primitives: Option<Primitives>,
 }
 
 impl Trace {
-    /// Adds the segment that environment 0 has just run.
-    pub(crate) fn add_segment(&mut self, environments: &PythonEnvironments, runner: &PolicyRunner) {
+    /// Adds the steps that environment 0 has just run.
+    pub(crate) fn add_steps(&mut self, environments: &PythonEnvironments, runner: &PolicyRunner) {
         let policy = &runner.policy;
         let (dims, observation_len) = (policy.layout().action_len, policy.env_observation_len());
         let (first_step, steps) = (self.rewards.len(), environments.steps()[0] as usize);

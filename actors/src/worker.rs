@@ -82,7 +82,8 @@ pub fn environments(
     on_hang: impl FnOnce(String) + Send + 'static,
 ) -> Result<PythonEnvironments, EnvironmentsError> {
     interpreter.seed(seeds::derive(config.run.seed, "python", stream))?;
-    environments::make(interpreter, config, config.actors.envs_per_worker, on_hang)
+    let (envs, steps) = (config.actors.envs_per_worker, config.policy.decision_steps());
+    environments::make(interpreter, config, envs, steps, on_hang)
 }
 
 /// Runs a worker until a stop is requested.

@@ -5,7 +5,7 @@ Run a trained policy, with NumPy only::
     import dmprl
 
     policy = dmprl.Policy.load("policy.safetensors")
-    actions = policy.segment(observation)
+    action = policy.action(observation)
 
 Train, read a run's evaluations, and create an environment::
 

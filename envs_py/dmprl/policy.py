@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from dmprl import zoo
 from dmprl.hold import Hold, NoHoldError
 from dmprl.numpy_policy import NumpyPolicy
+from dmprl.plan import Plan
 from dmprl.policy_description import check
 from dmprl.policy_file import PolicyFile, PolicyFileError, read
 from dmprl.predict import observation_rows, start_flags
@@ -46,7 +47,7 @@ class Policy:
         """The environment: ``observation_len``, ``action_low``, ``control_dt_s`` [s], …"""
         self.low: Actions = np.array(spec["action_low"], np.float64)
         self.high: Actions = np.array(spec["action_high"], np.float64)
-        self._network = NumpyPolicy(_plan(file), _flat(file))
+        self._network = NumpyPolicy(_network_plan(file), _flat(file))
         self._has_state = self._network.state.shape[1] > 0
         self.segment_steps: int = self._network.segment_steps
         """Control steps per decision, K."""
@@ -57,7 +58,9 @@ class Policy:
         self._hold_after = self.segment_steps
         self._deadline_s = np.inf
         self._clock: Callable[[], float] = time.monotonic
-        self._decided: Actions = np.zeros((self.segment_steps, self.low.size))
+        self._plan = Plan(self.segment_steps, self.low.size)
+        execution = file.description["policy"].get("execution", "segment")
+        self._is_ensemble = execution == "ensemble" and self.segment_steps > 1
         self._others: list[Policy] = []
         """Act in the other environments of :meth:`predict`, each at its own step."""
         self._start_episode()
@@ -162,7 +165,7 @@ class Policy:
         self._others.clear()  # they have the limits from before
 
     def reset(self, y0: Sequence[float] | NDArray | None = None) -> None:
-        """Starts an episode. The next action starts a segment.
+        """Starts an episode. The next action starts a plan.
 
         A limited rate starts from the hold, as if the robot had executed the hold before. State the
         robot's present position before, if it is held by one.
@@ -189,7 +192,7 @@ class Policy:
         self._network.state[:] = 0.0
         if y0 is not None:
             self._network.state[0, : self.low.size] = y0
-        self._step = self.segment_steps
+        self._plan.clear()
         self._previous: Actions | None = None
         self._called_at_s: float | None = None
         self._missed = 0
@@ -198,7 +201,7 @@ class Policy:
     def segment(self, observation: ArrayLike) -> Actions:
         """Decides the next segment's actions, (K, A), in the environment's units.
 
-        All of them must be executed.
+        For a caller that executes all of them. Drops the rest of the plan.
 
         :param observation: (O,) in the environment's units.
         :raises ValueError: if the observation is invalid, or the network's outputs are NaN. The
@@ -206,19 +209,22 @@ class Policy:
             observation.
         """
         self._called_at_s = None  # the caller returns after K steps
-        self._decide(self._checked(observation))
+        seen = self._checked(observation)
+        self._plan.clear()
+        self._decide(seen)
         self._missed, self._holding = 0, False
         return np.stack([self._next_action() for _ in range(self.segment_steps)])
 
     def action(self, observation: ArrayLike | None = None) -> Actions:
         """Returns the next control step's action, (A,), in the environment's units.
 
-        At a segment's first step the policy decides from the observation. Within a segment it
-        executes that decision, and observations only reset the watchdog.
+        With ``policy.execution = "ensemble"`` the policy decides from every observation and blends
+        the new segment with the rest of its plan. With ``"segment"`` it decides at a segment's
+        first step; within the segment, observations only reset the watchdog.
 
         :param observation: (O,); None if there is no new one since the last call. After
-            ``hold_after`` calls without one, if a decision is due without one, or after the
-            deadline, the action is the hold; the next observation then starts a new segment.
+            ``hold_after`` calls without one, if no action is planned, or after the deadline, the
+            action is the hold; the next observation then starts a new plan.
         :raises ValueError: as :meth:`segment`, at every step.
         :raises dmprl.NoHoldError: if there is no observation and no hold is stated.
         """
@@ -230,13 +236,15 @@ class Policy:
             return self._limited(self._known_hold())
         if observation is not None:
             seen = self._checked(observation)
-            if self._step == self.segment_steps or self._holding:
+            if self._holding:
+                self._plan.clear()
+            if self._is_ensemble or self._plan.is_empty:
                 self._decide(seen)
             self._missed, self._holding = 0, False
         else:
             self._known_hold()
             self._missed += 1
-            due = self._step == self.segment_steps
+            due = self._plan.is_empty
             self._holding = self._holding or due or self._missed > self._hold_after
         if self._holding:
             return self._limited(self._known_hold())
@@ -275,7 +283,7 @@ class Policy:
         """Returns an action towards the hold, as far as the rate limit allows, (A,).
 
         Use it after an error, and whenever the policy must not act. The next observation starts a
-        new segment.
+        new plan.
 
         :raises dmprl.NoHoldError: if no hold is stated.
         """
@@ -315,8 +323,8 @@ class Policy:
         return before_s is not None and not 0.0 <= self._called_at_s - before_s <= self._deadline_s
 
     def _next_action(self) -> Actions:
-        """Returns the segment's next action, limited."""
-        action = self._limited(self._decided[self._step])
+        """Returns the next planned action, limited."""
+        action = self._limited(self._network.scaled(self._plan.take()))
         self._step += 1
         self._network.carry_from(self._step)
         return action
@@ -336,12 +344,12 @@ class Policy:
         with np.errstate(over="ignore", invalid="ignore"):
             u = self._network.u(seen[None])
         if np.isnan(u).any():
-            self._step = self.segment_steps
+            self._plan.clear()
             raise ValueError(
                 "the policy's actions for this observation are not finite: it is far outside the "
                 "training data"
             )
-        self._decided = self._network.scaled(u)[0]
+        self._plan.add(u[0])
         self._step = 0
 
     def _checked(self, observation: ArrayLike) -> NDArray[np.float32]:
@@ -369,7 +377,7 @@ def _broadcast(what: str, values: ArrayLike, shape: tuple[int, ...]) -> Actions:
     return np.broadcast_to(array, shape).copy()
 
 
-def _plan(file: PolicyFile) -> dict[str, Any]:
+def _network_plan(file: PolicyFile) -> dict[str, Any]:
     """Creates the plan for :class:`NumpyPolicy`."""
     description = file.description
     policy, spec = description["policy"], description["spec"]

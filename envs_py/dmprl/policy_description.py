@@ -15,6 +15,7 @@ WORDS = {
     "dmp.forcing_scaling": ("none", "goal"),
 }
 """Known values of each key that changes the policy's function. Newer files may have others."""
+EXECUTIONS = ("segment", "ensemble")
 POSITIVE = ("policy.goal_range", "policy.rho_range", "policy.position_scale", "dmp.alpha_y")
 COUNTS = ("policy.segment_steps", "dmp.basis_count", "spec.observation_len", "spec.action_len")
 
@@ -30,10 +31,12 @@ def check(description: dict[str, Any]) -> None:
     for key in POSITIVE:
         found = value(description, key)
         expect(key, found, is_finite(found) and found > 0, "a positive number")
-    # Files of older versions do not have it.
+    # Files of older versions do not have the next two.
     found = description["policy"].get("action_range", 1.0)
     fits = is_finite(found) and 0 < found <= 1
     expect("policy.action_range", found, fits, "a number above 0, at most 1")
+    found = description["policy"].get("execution", "segment")
+    expect("policy.execution", found, found in EXECUTIONS, f"one of {', '.join(EXECUTIONS)}")
     for key in COUNTS:
         found = value(description, key)
         expect(key, found, isinstance(found, int) and found > 0, "an integer, 1 or more")

@@ -1,8 +1,8 @@
 """The interface between a worker and its environments: one call per segment for all of them.
 
-A policy decides once per *segment* of K actions, which are applied open loop. So the worker calls
-Python only once per segment, for all its E environments together. Shapes: E environments, K steps
-of a segment, O observation, A action.
+In training, a policy decides once per *segment* of K actions, which are applied open loop. So the
+worker calls Python only once per segment, for all its E environments together. Shapes: E
+environments, K steps of a segment, O observation, A action.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ const CORNERS: [f64; 4] = [0.0, -0.0, 1.0, -1.0];
 type Keys = &'static [(&'static str, &'static str)];
 
 /// Name, task, and configuration keys that differ from the task's defaults.
-pub const KINDS: [(&str, &str, Keys); 14] = [
+pub const KINDS: [(&str, &str, Keys); 15] = [
     ("dmp", "reacher", &[]),
     ("mlp", "pusher", &[("policy.kind", "mlp")]),
     ("sac-chunk", "pusher", &[("algorithm.name", "sac"), ("policy.kind", "chunk")]),
@@ -39,12 +39,21 @@ pub const KINDS: [(&str, &str, Keys); 14] = [
     ),
     ("tqc-dmp", "reacher", &[("algorithm.name", "tqc")]),
     ("angles", "reacher", &[("policy.start", "observed"), ("policy.rho", "free")]),
-    ("values", "panda-reach", &[("policy.start", "observed")]),
+    ("values", "panda-reach", &[("policy.start", "observed"), ("policy.execution", "segment")]),
     ("resting", "pusher", &[("policy.start", "observed"), ("policy.start_velocity", "zero")]),
     (
         "carry",
         "pusher",
         &[("policy.start", "carry"), ("exploration.warm_up_kind", "dmp_parameters")],
+    ),
+    (
+        "action-segment",
+        "pusher",
+        &[
+            ("policy.start", "action"),
+            ("policy.controller", "direct"),
+            ("policy.execution", "segment"),
+        ],
     ),
     ("action", "pusher", &[("policy.start", "action"), ("policy.controller", "direct")]),
     ("action-chunk", "reacher", &[("policy.start", "action"), ("policy.kind", "chunk")]),
@@ -54,6 +63,7 @@ pub const KINDS: [(&str, &str, Keys); 14] = [
         "reacher",
         &[
             ("algorithm.name", "ndp"),
+            ("policy.execution", "segment"),
             ("exploration.warm_up_steps", "0"),
             ("algorithm.action_rate_penalty", "0.0"),
             ("policy.controller", "position"),

@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicBool;
 use dmprl_actors::evaluate::{Episodes, Evaluation, Evaluator};
 use dmprl_actors::python_env::{Interpreter, InterpreterOptions, PythonEnvironments};
 use dmprl_actors::rollout::{Identity, Rollout, RolloutError};
-use dmprl_shared::config::{ExperimentConfig, Layers, TaskConfig};
+use dmprl_shared::config::{Execution, ExperimentConfig, Layers, TaskConfig};
 use dmprl_shared::segment::{SegmentHeader, TRUNCATED};
 use dmprl_tests::{tiny_envs_dir, venv};
 
@@ -29,14 +29,14 @@ fn config(failures_max: u32) -> ExperimentConfig {
     layers.finish().unwrap()
 }
 
-fn environments(task_id: &str) -> PythonEnvironments {
+fn environments(task_id: &str, steps: usize) -> PythonEnvironments {
     static INTERPRETER: OnceLock<Interpreter> = OnceLock::new();
     let start = || {
         let (venv, python_path) = (venv().venv.clone(), vec![tiny_envs_dir()]);
         Interpreter::start(&InterpreterOptions { venv, python_path }).unwrap()
     };
     let interpreter = INTERPRETER.get_or_init(start);
-    PythonEnvironments::start(interpreter, &TaskConfig::with_id(task_id), ENVS, 5).unwrap()
+    PythonEnvironments::start(interpreter, &TaskConfig::with_id(task_id), ENVS, steps).unwrap()
 }
 
 /// Returns the headers that a worker delivers in this many calls, and the error that stopped it
@@ -58,7 +58,7 @@ fn delivered(rollout: &mut Rollout, calls: usize) -> (Vec<SegmentHeader>, Option
 
 fn started(task_id: &str, failures_max: u32) -> Rollout {
     let identity = Identity { run_id: 1, worker_id: 0, incarnation: 0, seed_index: 0 };
-    Rollout::start(&config(failures_max), environments(task_id), identity).unwrap()
+    Rollout::start(&config(failures_max), environments(task_id, 5), identity).unwrap()
 }
 
 fn of_env(headers: &[SegmentHeader], env: u32) -> Vec<(u32, u32, u32)> {
@@ -126,8 +126,14 @@ fn a_foreign_environment_that_hands_out_nan_is_reset_and_goes_on() {
     assert_eq!(failures.len(), 1);
 }
 
-fn evaluated(task_id: &str) -> (Evaluator, Result<Option<Evaluation>, RolloutError>) {
-    let mut evaluator = Evaluator::new(&config(0), environments(task_id), ENVS).unwrap();
+fn evaluated(
+    task_id: &str,
+    execution: Execution,
+) -> (Evaluator, Result<Option<Evaluation>, RolloutError>) {
+    let mut config = config(0);
+    config.policy.execution = execution;
+    let environments = environments(task_id, config.policy.execution_steps());
+    let mut evaluator = Evaluator::new(&config, environments, ENVS).unwrap();
     let len = evaluator.policy().parameters_len();
     let parameters: Vec<f32> = (0..len).map(|i| ((i * 37) % 129) as f32 / 640.0 - 0.1).collect();
     let stop = AtomicBool::new(false);
@@ -139,17 +145,19 @@ fn evaluated(task_id: &str) -> (Evaluator, Result<Option<Evaluation>, RolloutErr
 /// `Long` is the same environment without the fault.
 #[test]
 fn an_episode_that_fails_in_an_evaluation_is_repeated_with_its_seed() {
-    let (mut evaluator, evaluation) = evaluated("tiny_envs:FaultyRaise-v0");
-    assert_eq!(evaluator.take_failures().len(), ENVS, "one in the fourth episode of each");
-    let (_, expected) = evaluated("tiny_envs:Long-v0");
-    let expected = expected.unwrap().unwrap();
-    assert!(expected.returns.iter().all(|return_| *return_ != 0.0), "{expected:?}");
-    assert_eq!(evaluation.unwrap().unwrap(), expected);
+    for execution in [Execution::Segment, Execution::Ensemble] {
+        let (mut evaluator, evaluation) = evaluated("tiny_envs:FaultyRaise-v0", execution);
+        assert_eq!(evaluator.take_failures().len(), ENVS, "one in the fourth episode of each");
+        let (_, expected) = evaluated("tiny_envs:Long-v0", execution);
+        let expected = expected.unwrap().unwrap();
+        assert!(expected.returns.iter().all(|return_| *return_ != 0.0), "{expected:?}");
+        assert_eq!(evaluation.unwrap().unwrap(), expected, "{execution:?}");
+    }
 }
 
 #[test]
 fn an_episode_that_fails_again_ends_the_evaluation_and_says_which() {
-    let (mut evaluator, evaluation) = evaluated("tiny_envs:Hopeless-v0");
+    let (mut evaluator, evaluation) = evaluated("tiny_envs:Hopeless-v0", Execution::Segment);
     let message = evaluation.unwrap_err().to_string();
     assert!(message.contains("the episode with seed 50 has failed 2 times"), "{message}");
     assert!(message.contains("environment 0, step 0 of the segment: ValueError"), "{message}");

@@ -140,6 +140,8 @@ impl RunDirectory {
             .parse()
             .with_context(|| format!("{} is not valid TOML", path.display()))?;
         let mut layers = Layers::new();
+        // Runs that are older than this key executed whole segments.
+        layers.set("defaults", "policy.execution", "segment")?;
         layers.add(&path.display().to_string(), table)?;
         Ok(layers.finish()?)
     }

@@ -6,6 +6,7 @@ use std::process::Command;
 use anyhow::bail;
 use dmprl_control::{self as control, EvaluationRequest, EvaluationRow, Report};
 use dmprl_run::RunDirectory;
+use dmprl_shared::config::Execution;
 
 use super::conversation::{Conversation, Turn};
 use super::launcher::Launcher;
@@ -25,6 +26,8 @@ pub struct EvaluationPlan<'a> {
     pub episodes: u64,
     /// Another `task.randomise` than the run's, as TOML.
     pub randomise: Option<String>,
+    /// Another `policy.execution` than the run's.
+    pub execution: Option<Execution>,
 }
 
 /// Evaluates a saved policy; returns `None` if the user interrupts.
@@ -37,6 +40,9 @@ pub fn evaluate(plan: EvaluationPlan<'_>) -> anyhow::Result<Option<EvaluationRow
     command.arg("--run").arg(plan.run.path());
     if let Some(randomise) = &plan.randomise {
         command.arg("--randomise").arg(randomise);
+    }
+    if let Some(execution) = plan.execution {
+        command.arg("--execution").arg(execution.name());
     }
     if let Some(venv) = &plan.venv {
         command.arg("--venv").arg(venv);

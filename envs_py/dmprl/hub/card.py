@@ -185,7 +185,7 @@ import dmprl
 
 policy = dmprl.Policy.load("policy.safetensors")
 observation = [0.0] * {facts.spec["observation_len"]}  # of the environment or the robot
-actions = policy.segment(observation)  # (K, {facts.spec["action_len"]})
+action = policy.action(observation)  # ({facts.spec["action_len"]},), once per control step
 ```"""
 
 

@@ -22,8 +22,9 @@ pub use algorithm::{
     LearningRateDecay, NdpConfig, SacConfig, Target, Td3Config, TqcConfig, WarmUpKind, Windows,
 };
 pub use dmprl_runtime::config::{
-    AlgorithmName, BasisWidths, CanonicalIntegration, Controller, DmpConfig, ForcingScaling,
-    Integrator, PolicyConfig, PolicyKind, RangeError, RhoKind, Start, StartSource, StartVelocity,
+    AlgorithmName, BasisWidths, CanonicalIntegration, Controller, DmpConfig, Execution,
+    ForcingScaling, Integrator, PolicyConfig, PolicyKind, RangeError, RhoKind, Start, StartSource,
+    StartVelocity,
 };
 use dmprl_runtime::config::{check_hidden, range};
 pub use experiment::{

@@ -90,6 +90,7 @@ updates_per_segment = 5.0
 const PAPER: &str = r#"
 [policy]
 segment_steps = 5
+execution = "segment"
 hidden = [256, 256]
 normalise_observations = false
 action_range = 1.0
@@ -238,6 +239,7 @@ pub fn algorithm_defaults(name: AlgorithmName) -> Option<Table> {
 // waits for its segments anyway.
 const NDP: &str = r#"
 [policy]
+execution = "segment"
 action_range = 1.0
 controller = "position"
 hidden = [256, 256]

@@ -23,6 +23,7 @@ mod documents;
 mod endings;
 mod env_kwargs;
 mod environments;
+mod execution;
 mod export;
 mod fairness;
 mod faults;

@@ -121,8 +121,8 @@ fn a_rerun_log_of_two_runs_is_written_beside_the_video() {
             assert_eq!(rows[&path], expected, "{path}: {rows}");
         }
     }
-    // Ten segments of five steps, and fifty decisions.
-    assert_eq!(rows["/dmp/episode_1000/segment/goal/action\\[0\\]"], 10, "{rows}");
+    // Both decide at every step.
+    assert_eq!(rows["/dmp/episode_1000/segment/goal/action\\[0\\]"], 50, "{rows}");
     assert_eq!(rows["/mlp/episode_1000/segment/index"], 50, "{rows}");
     place.assert_no_process();
 }

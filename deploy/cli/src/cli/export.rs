@@ -7,7 +7,8 @@ use dmprl_analysis::export::{onnx, read_policy, safetensors};
 use dmprl_run::failure::{Outcome, wrong_use};
 use dmprl_run::format::{binary_bytes, shown};
 use dmprl_run::{PolicyChoice, replace_file};
-use dmprl_shared::policy::Hold;
+use dmprl_shared::config::Execution;
+use dmprl_shared::policy::{Hold, Policy};
 use dmprl_shared::policy_file::OpenedPolicy;
 
 use super::{emit, open_run};
@@ -21,10 +22,15 @@ input `observation` (batch, O), output `actions` (batch, K, A).
 For a robot, state with --hold the command that holds it, as in docs/robot.md. Without it, the file
 acts in simulations; on a robot, the program that drives it must state the hold.
 
+A robot executes segments as policy.execution states in training; --execution changes it. Runs from
+before this key have `segment`, and `ensemble` makes them smoother. An onnx file
+computes whole segments with both.
+
 EXAMPLES
   dmprl export runs/mine                           # runs/mine/reacher.safetensors
   dmprl export runs/mine --hold zero-velocity      # for a robot that takes velocities
   dmprl export runs/mine --hold position=0.1,-0.5  # for a robot that takes positions of two joints
+  dmprl export runs/old --execution ensemble
   dmprl export runs/mine --format onnx --output reacher.onnx
   dmprl export runs/mine --policy latest --json";
 
@@ -47,6 +53,9 @@ pub(super) struct ExportArgs {
     /// per action.
     #[arg(long, value_name = "HOLD", allow_hyphen_values = true)]
     hold: Option<Hold>,
+    /// How a robot executes segments, instead of the run's policy.execution.
+    #[arg(long, value_name = "segment|ensemble")]
+    execution: Option<Execution>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -93,6 +102,14 @@ pub(super) fn state_hold(opened: &mut OpenedPolicy, hold: Option<&Hold>) -> anyh
     Ok(())
 }
 
+/// Changes how a robot executes segments.
+fn state_execution(opened: &mut OpenedPolicy, execution: Execution) -> anyhow::Result<()> {
+    let mut description = opened.policy.description().clone();
+    description.policy.execution = execution;
+    opened.policy = Policy::new(description)?;
+    Ok(())
+}
+
 pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
     let named = args.output.as_deref().and_then(Format::of);
     let format = args.format.or(named).unwrap_or(Format::Safetensors);
@@ -109,6 +126,7 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
     let chosen = run.choose_policy(args.policy)?;
     let mut opened = read_policy(&run, &chosen)?;
     state_hold(&mut opened, args.hold.as_ref())?;
+    args.execution.map_or(Ok(()), |execution| state_execution(&mut opened, execution))?;
     let task = run.config()?.task.name;
     let path = args.output.clone().unwrap_or_else(|| {
         let name = dmprl_run::safe_name(&task);
@@ -147,7 +165,7 @@ pub(super) fn run(args: &ExportArgs) -> anyhow::Result<Outcome> {
         );
         match format {
             Format::Safetensors => format!(
-                "{head}\n{held}\nin Python: dmprl.Policy.load({:?}).segment(observation)",
+                "{head}\n{held}\nin Python: dmprl.Policy.load({:?}).action(observation)",
                 path.display().to_string()
             ),
             Format::Onnx => format!("{head}\n{held}"),

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use dmprl_shared::config::Execution;
 
 const LEARNER_HELP: &str = "\
 Exchanges JSON lines with the supervisor on standard input and output; logs to standard error.
@@ -178,6 +179,9 @@ pub struct EvaluatorArgs {
     /// Table instead of `task.randomise`.
     #[arg(long, value_name = "TOML")]
     pub randomise: Option<String>,
+    /// Execution instead of `policy.execution`.
+    #[arg(long, value_name = "segment|ensemble")]
+    pub execution: Option<Execution>,
     /// Python virtual environment.
     #[arg(long, value_name = "DIR")]
     pub venv: Option<PathBuf>,

@@ -23,6 +23,9 @@ pub fn run(args: &EvaluatorArgs, control: &ControlPipe) -> anyhow::Result<()> {
     if let Some(text) = &args.randomise {
         config.task.randomise = toml::from_str(text).context("--randomise")?;
     }
+    if let Some(execution) = args.execution {
+        config.policy.execution = execution;
+    }
     let interpreter = super::actor::start_interpreter(args.venv.as_deref(), &config)?;
     let mut evaluator = evaluator::evaluator(&interpreter, &config, on_hang(control))?;
     let policy_path = |version| setup.run.policy_path(version);

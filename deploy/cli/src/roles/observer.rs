@@ -31,7 +31,7 @@ pub fn run(args: &ObserverArgs, control: &ControlPipe) -> anyhow::Result<()> {
     let environment = PythonEnvironments::start_recording(
         &interpreter,
         &setup.config.task,
-        setup.config.policy.decision_steps(),
+        setup.config.policy.execution_steps(),
         args.pictures.as_deref(),
     )?;
     environments::watch(&environment, &setup.config, on_hang(control))?;

@@ -1,5 +1,7 @@
 //! Configuration of the policy: its kind, its DMP and its inverse controller.
 
+use std::str::FromStr;
+
 #[cfg(feature = "schema")]
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -197,6 +199,47 @@ pub enum StartVelocity {
     Zero,
 }
 
+/// How a policy acts without exploration. Training workers always execute whole segments.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum Execution {
+    /// Decides once per segment and executes all of its actions.
+    Segment,
+    /// Decides at every step. The action is the mean of the new segment's first action and of the
+    /// one that was planned for this step; the rest of the plan is blended in the same way
+    /// (temporal ensembling, Zhao et al. 2023). The motion is smoother and sees every observation.
+    Ensemble,
+}
+
+impl Execution {
+    /// The name in a configuration.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Segment => "segment",
+            Self::Ensemble => "ensemble",
+        }
+    }
+
+    /// The execution of policies that are older than this key.
+    fn of_older_files() -> Self {
+        Self::Segment
+    }
+}
+
+impl FromStr for Execution {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let known = [Self::Segment, Self::Ensemble];
+        known
+            .into_iter()
+            .find(|execution| execution.name() == name)
+            .ok_or_else(|| "expected segment or ensemble".to_owned())
+    }
+}
+
 /// Entries of an observation from which one action dimension's y0 and yd0 are read.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(JsonSchema))]
@@ -234,9 +277,11 @@ fn unit_scale() -> f32 {
 pub struct PolicyConfig {
     /// Kind of policy.
     pub kind: PolicyKind,
-    /// Environment steps K per decision, executed open-loop. Ignored by `mlp`, which decides at
-    /// every step.
+    /// Environment steps K per decision. Ignored by `mlp`, which decides at every step.
     pub segment_steps: usize,
+    /// How evaluations and robots execute segments. Ignored by `mlp`.
+    #[serde(default = "Execution::of_older_files")]
+    pub execution: Execution,
     /// Widths of the actor's hidden layers.
     pub hidden: Vec<usize>,
     /// Whether observations are normalised to zero mean and unit scale before they enter the
@@ -269,6 +314,7 @@ impl Default for PolicyConfig {
         Self {
             kind: PolicyKind::Dmp,
             segment_steps: 5,
+            execution: Execution::Ensemble,
             hidden: vec![256, 256],
             normalise_observations: true,
             action_range: 1.0,
@@ -292,6 +338,18 @@ impl PolicyConfig {
             PolicyKind::Dmp | PolicyKind::Chunk => self.segment_steps,
             PolicyKind::Mlp => 1,
         }
+    }
+
+    /// Returns whether the policy blends segments when it does not explore.
+    #[must_use]
+    pub fn is_ensemble(&self) -> bool {
+        self.execution == Execution::Ensemble && self.decision_steps() > 1
+    }
+
+    /// Returns the steps between two decisions without exploration: 1 for an ensemble.
+    #[must_use]
+    pub fn execution_steps(&self) -> usize {
+        if self.is_ensemble() { 1 } else { self.decision_steps() }
     }
 
     /// Returns the length of the state (y, yd) that follows the environment's observation: 2A or 0.

@@ -7,8 +7,8 @@ mod range;
 
 pub use algorithm_name::AlgorithmName;
 pub use dmp::{
-    BasisWidths, CanonicalIntegration, Controller, DmpConfig, ForcingScaling, Integrator,
-    PolicyConfig, PolicyKind, RhoKind, Start, StartSource, StartVelocity,
+    BasisWidths, CanonicalIntegration, Controller, DmpConfig, Execution, ForcingScaling,
+    Integrator, PolicyConfig, PolicyKind, RhoKind, Start, StartSource, StartVelocity,
 };
 pub use policy_check::check_hidden;
 pub use range::{RangeError, range};

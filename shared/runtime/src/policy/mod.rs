@@ -22,6 +22,7 @@ mod hold;
 mod learned_std;
 mod matrix;
 mod network;
+mod plan;
 mod start;
 mod tanh;
 
@@ -38,6 +39,7 @@ pub use hold::{Hold, HoldError};
 pub use learned_std::LearnedStd;
 pub use matrix::{Keep, Matrix, product};
 pub use network::{Activations, Layer, MlpShape, SmallBatchNetwork, forward, initial_parameters};
+pub use plan::Plan;
 pub use tanh::tanh;
 
 use crate::config::{Controller, PolicyKind, RangeError};

@@ -12,7 +12,7 @@ use deadline::Deadline;
 pub use error::RuntimeError;
 pub use safety::{HOLD_STEPS_MAX, Safety};
 
-use crate::policy::{Head, Policy, PolicyWorkspace, SmallBatchNetwork};
+use crate::policy::{Head, Plan, Policy, PolicyWorkspace, SmallBatchNetwork};
 use crate::policy_file::{self, OpenedPolicy};
 use crate::spec::EnvSpec;
 
@@ -31,11 +31,15 @@ pub struct PolicyRuntime {
     state: Vec<f32>,
     /// The last action as u in [-1, 1], (A,).
     last_u: Vec<f32>,
-    /// The segment's actions before limits, (K, A), in the environment's units.
-    decided: Vec<f64>,
+    /// The actions of the next steps, before limits.
+    plan: Plan,
+    /// Whether each observation changes the plan.
+    is_ensemble: bool,
+    /// The next action before limits, (A,), in the environment's units.
+    wanted: Vec<f64>,
     /// The segment's actions after limits, (K, A).
     given: Vec<f64>,
-    /// Executed steps of the segment. At K the next step needs a decision.
+    /// Executed steps since the last decision.
     step: usize,
     /// The previous action, (A,).
     previous: Vec<f64>,
@@ -77,9 +81,11 @@ impl PolicyRuntime {
             seen: vec![0.0; layout.observation_len],
             state: vec![0.0; policy.state_len()],
             last_u: vec![0.0; layout.action_len],
-            decided: vec![0.0; layout.actions_len()],
+            plan: Plan::new(layout),
+            is_ensemble: policy.description().policy.is_ensemble(),
+            wanted: vec![0.0; layout.action_len],
             given: vec![0.0; layout.actions_len()],
-            step: layout.segment_steps,
+            step: 0,
             previous: vec![0.0; layout.action_len],
             deadline: None,
             has_acted: false,
@@ -143,7 +149,7 @@ impl PolicyRuntime {
         self.holding
     }
 
-    /// Starts an episode. The next action starts a segment.
+    /// Starts an episode. The next action starts a plan.
     ///
     /// A rate limit applies from the first action on, relative to the hold.
     ///
@@ -170,7 +176,7 @@ impl PolicyRuntime {
         if let Some(y0) = y0 {
             self.state[..y0.len()].copy_from_slice(y0);
         }
-        self.step = self.segment_steps();
+        self.plan.clear();
         self.missed = 0;
         self.holding = false;
         self.has_acted = false;
@@ -178,8 +184,8 @@ impl PolicyRuntime {
         Ok(())
     }
 
-    /// Decides the next segment's actions, (K, A), in the environment's units. All of them must be
-    /// executed.
+    /// Decides the next segment's actions, (K, A), in the environment's units, for a caller that
+    /// executes all of them. Drops the rest of the plan.
     ///
     /// - `observation`: (O,) in the environment's units.
     ///
@@ -188,10 +194,12 @@ impl PolicyRuntime {
     /// [`PolicyRuntime::hold`] then. The policy continues at the next valid observation.
     pub fn segment(&mut self, observation: &[f64]) -> Result<&[f64], RuntimeError> {
         self.restart_deadline(); // the caller returns after K steps
+        self.check(observation)?;
+        self.plan.clear();
         self.decide(observation)?;
         self.missed = 0;
         self.holding = false;
-        while self.step < self.segment_steps() {
+        while !self.plan.is_empty() {
             self.give();
         }
         Ok(&self.given)
@@ -199,13 +207,14 @@ impl PolicyRuntime {
 
     /// Returns the next control step's action, (A,), in the environment's units.
     ///
-    /// At a segment's first step the policy decides from the observation. Within a segment it
-    /// executes that decision, and observations only reset the watchdog.
+    /// With `policy.execution = "ensemble"` the policy decides from every observation and blends
+    /// the new segment with the rest of its plan. With `"segment"` it decides at a segment's first
+    /// step; within the segment, observations only reset the watchdog.
     ///
     /// - `observation`: (O,) in the environment's units; `None` if there is no new one since the
-    ///   last call. After more than [`Safety::hold_after`] calls with `None`, or with `None` at a
-    ///   segment's first step, or after the deadline, the action is the hold, and the next
-    ///   observation starts a new segment.
+    ///   last call. After more than [`Safety::hold_after`] calls with `None`, or with `None` where
+    ///   no action is planned, or after the deadline, the action is the hold, and the next
+    ///   observation starts a new plan.
     ///
     /// # Errors
     /// As [`PolicyRuntime::segment`], at every step; `NoHold` with `None`.
@@ -218,7 +227,10 @@ impl PolicyRuntime {
         }
         match observation {
             Some(observation) => {
-                if self.step == self.segment_steps() || self.holding {
+                if self.holding {
+                    self.plan.clear();
+                }
+                if self.is_ensemble || self.plan.is_empty() {
                     self.decide(observation)?;
                 } else {
                     self.check(observation)?;
@@ -230,7 +242,7 @@ impl PolicyRuntime {
                 self.safety.hold()?;
                 self.missed = self.missed.saturating_add(1);
                 self.holding |= self.missed > self.safety.hold_after();
-                self.holding |= self.step == self.segment_steps();
+                self.holding |= self.plan.is_empty();
             }
         }
         if self.holding {
@@ -298,13 +310,14 @@ impl PolicyRuntime {
         }
     }
 
-    /// Limits the segment's next action and writes it to `given` and `previous`.
+    /// Limits the next planned action, if there is one, and writes it to `given` and `previous`.
     fn give(&mut self) {
+        let Some(u) = self.plan.take() else { return };
+        self.policy.scaling().apply(u, &mut self.wanted);
         self.begin_at_hold();
+        self.safety.limit(&self.wanted, &mut self.previous);
         let dims = self.previous.len();
-        let cells = self.step * dims..(self.step + 1) * dims;
-        self.safety.limit(&self.decided[cells.clone()], &mut self.previous);
-        self.given[cells].copy_from_slice(&self.previous);
+        self.given[self.step * dims..(self.step + 1) * dims].copy_from_slice(&self.previous);
         self.step += 1;
         if self.policy.carries_dmp_state()
             && let (Head::Dmp(head), Some(dmp)) = (self.policy.head(), &self.work.dmp)
@@ -334,10 +347,10 @@ impl PolicyRuntime {
         self.policy.decode(&self.seen, &mut self.work);
         // Far outside the training data, sums of large numbers may be NaN.
         if self.work.actions.iter().any(|u| u.is_nan()) {
-            self.step = self.segment_steps();
+            self.plan.clear();
             return Err(RuntimeError::Decision);
         }
-        self.policy.scaling().apply(&self.work.actions, &mut self.decided);
+        self.plan.add(&self.work.actions);
         self.step = 0;
         Ok(())
     }

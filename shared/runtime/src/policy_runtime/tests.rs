@@ -19,7 +19,7 @@ fn spec() -> EnvSpec {
 }
 
 fn policy(keys: &[(&str, &str)]) -> Policy {
-    let keys = [&[("policy.hidden", "[32]")], keys].concat();
+    let keys = [&[("policy.hidden", "[32]"), ("policy.execution", "segment")], keys].concat();
     Policy::new(description(spec(), &keys)).unwrap()
 }
 
@@ -37,6 +37,8 @@ fn position(values: &[f64]) -> Hold {
 
 const CARRY: &[(&str, &str)] = &[("policy.start", "carry")];
 const ACTION: &[(&str, &str)] = &[("policy.start", "action"), ("policy.controller", "direct")];
+
+const ENSEMBLE: &[(&str, &str)] = &[("policy.execution", "ensemble")];
 
 fn observation(seed: f64) -> [f64; 4] {
     std::array::from_fn(|i| (seed + i as f64).sin())
@@ -81,10 +83,51 @@ fn actions_step_by_step_equal_the_segment() {
     }
 }
 
+#[test]
+fn ensemble_blends_the_segment_of_each_observation_with_its_plan() {
+    for (ensemble, keys) in [(true, &[][..]), (true, CARRY), (false, &[("policy.kind", "mlp")])] {
+        let mut runtime = runtime(&[keys, ENSEMBLE].concat());
+        assert_eq!(runtime.is_ensemble, ensemble, "{keys:?}");
+        let mut whole = self::runtime(keys);
+        let (mut planned, mut u) = (Plan::new(whole.policy.layout()), [0.0; DIMS]);
+        let mut expected = [0.0; DIMS];
+        for step in 0..12 {
+            let now = observation(f64::from(step));
+            whole.state.copy_from_slice(&runtime.state);
+            whole.segment(&now).unwrap();
+            planned.add(&whole.work.actions);
+            u.copy_from_slice(planned.take().unwrap());
+            whole.policy.scaling().apply(&u, &mut expected);
+            assert_eq!(runtime.action(Some(&now)).unwrap(), expected, "{keys:?}, step {step}");
+        }
+    }
+}
+
+#[test]
+fn ensemble_follows_its_plan_without_observations_and_drops_it_after_a_hold() {
+    let mut runtime = runtime(ENSEMBLE);
+    runtime.safety_mut().set_hold(&position(&[0.5, 2.0])).unwrap();
+    runtime.action(Some(&observation(1.0))).unwrap();
+    let now = observation(2.0);
+    runtime.action(Some(&now)).unwrap();
+    let mut plan = runtime.plan.clone();
+    let mut expected = [0.0; DIMS];
+    for step in 1..STEPS {
+        runtime.policy.scaling().apply(plan.take().unwrap(), &mut expected);
+        assert_eq!(runtime.action(None).unwrap(), expected, "step {step}");
+    }
+    assert_eq!(runtime.action(None).unwrap(), [0.5, 2.0], "the plan has ended");
+    let fresh = self::runtime(ENSEMBLE).action(Some(&now)).unwrap().to_vec();
+    assert_eq!(runtime.action(Some(&now)).unwrap(), fresh);
+    runtime.hold().unwrap();
+    assert_eq!(runtime.action(Some(&now)).unwrap(), fresh, "the plan from before is dropped");
+}
+
 /// Segments start where the robot is: at the last action after limits, held ones included.
 #[test]
 fn state_of_the_commands_follows_the_actions_that_were_given() {
-    for keys in [ACTION, &[("policy.start", "action"), ("policy.kind", "mlp")]] {
+    let ensemble = [ACTION, ENSEMBLE].concat();
+    for keys in [ACTION, &ensemble, &[("policy.start", "action"), ("policy.kind", "mlp")]] {
         let mut runtime = runtime(keys);
         runtime.safety_mut().set_hold(&position(&[0.0, 2.5])).unwrap();
         runtime.safety_mut().set_rate(&[0.05, 0.05]).unwrap();
