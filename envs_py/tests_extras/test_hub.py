@@ -73,7 +73,7 @@ class HubTest(unittest.TestCase):
         self.assertEqual((data.library_name, data.model_name), ("dmprl", "push-policy"))
         self.assertLessEqual({"reinforcement-learning", "robotics", "td3"}, set(data.tags))
         results = {it.metric_type: it.metric_value for it in data.eval_results}
-        self.assertEqual(results, {"mean_reward": "-15.20 +/- 7.04", "success_rate": 0.99})
+        self.assertEqual(results, {"mean_reward": "-14.38 +/- 5.47", "success_rate": 1.0})
         self.assertEqual(data.eval_results[0].dataset_type, "dmprl/PandaPush-v0")
 
     def test_a_revision_stays_available_and_an_old_film_is_removed(self):
