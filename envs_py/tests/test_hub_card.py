@@ -39,7 +39,7 @@ class CardTest(unittest.TestCase):
         text = card.model_card(facts())
         for line in [
             "| Task | `panda-push` (dmprl/PandaPush-v0) |",
-            "| Algorithm | TD3, policy `dmp`, 5 steps per decision |",
+            "| Algorithm | TD3, policy `dmp`, segments of 5 steps, blended at every step |",
             "| Seed of the training | 1 |",
             "| Environment steps | 200,000 |",
             "| Return | -14.38 ± 5.47 |",
@@ -77,6 +77,12 @@ class CardTest(unittest.TestCase):
         self.assertNotIn("<video", text)
         animation = card.model_card(facts(film=FILM.replace("mp4", "gif")))
         self.assertIn("![Episodes of the policy](https://", animation)
+
+    def test_the_kind_says_how_segments_are_executed(self):
+        policy = facts().config["policy"]
+        del policy["execution"]
+        self.assertEqual(card.kind(policy), "`dmp`, segments of 5 steps, executed as a whole")
+        self.assertEqual(card.kind(policy | {"kind": "mlp", "execution": "ensemble"}), "`mlp`")
 
     def test_names_cannot_break_the_metadata(self):
         config = facts().config

@@ -143,10 +143,9 @@ def result(facts: Facts) -> str:
     """Returns the table of the result, and its limits."""
     config, row = facts.config, facts.row
     count, first = len(row["returns"]), config["evaluation"]["first_seed"]
-    policy = f"`{config['policy']['kind']}`, {config['policy']['segment_steps']} steps per decision"
     lines = [
         ("Task", f"`{facts.task}` ({config['task']['id']})"),
-        ("Algorithm", f"{facts.algorithm.upper()}, policy {policy}"),
+        ("Algorithm", f"{facts.algorithm.upper()}, policy {kind(config['policy'])}"),
         ("Seed of the training", str(config["run"]["seed"])),
         ("Environment steps", f"{row['env_steps']:,}"),
         ("Return", f"{row['return_mean']:.2f} ± {np.std(row['returns']):.2f}"),
@@ -163,6 +162,16 @@ def result(facts: Facts) -> str:
             "have a lower return."
         )
     return f"| | |\n|---|---|\n{rows}\n{text}"
+
+
+def kind(policy: dict[str, Any]) -> str:
+    """Returns the kind of a policy and how its segments are executed."""
+    if policy["kind"] == "mlp":
+        return "`mlp`"
+    # Runs of older versions do not have it.
+    blends = policy.get("execution") == "ensemble"
+    how = "blended at every step" if blends else "executed as a whole"
+    return f"`{policy['kind']}`, segments of {policy['segment_steps']} steps, {how}"
 
 
 def use(facts: Facts) -> str:
