@@ -20,6 +20,9 @@ fn every_link_has_a_target_and_no_page_needs_a_network() {
         if page.text.contains("{{#") {
             wrong.push(format!("{}: an include was not found", page.path.display()));
         }
+        if let Some(number) = unlinked(&page.text) {
+            wrong.push(format!("{}: [{number}] has no link", page.path.display()));
+        }
         let remote = page.fetched.iter().filter(|link| link.contains("//"));
         wrong.extend(remote.map(|link| format!("{} fetches {link}", page.path.display())));
         wrong.extend(page.links.iter().filter_map(|link| {
@@ -54,6 +57,14 @@ fn fault(page: &Page, link: &str, pages: &[Page]) -> Option<String> {
     let target = pages.iter().find(|page| page.path == target)?;
     let there = target.anchors.contains(anchor);
     (!there).then(|| format!("{} has no #{anchor}", target.path.display()))
+}
+
+/// Returns a decision's number in brackets that did not become a link, such as `[0130]`.
+fn unlinked(text: &str) -> Option<&str> {
+    let in_brackets = text.split('[').skip(1).filter_map(|rest| rest.split_once(']'));
+    in_brackets
+        .map(|(inside, _)| inside)
+        .find(|inside| inside.len() == 4 && inside.bytes().all(|byte| byte.is_ascii_digit()))
 }
 
 #[test]
