@@ -1,6 +1,7 @@
 //! Draws scatter plots side by side with one vertical axis: a point with bars for each method, and
 //! a line through the points that no other point beats in both directions.
 
+use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
 /// Maximum number of panels in a row.
@@ -15,6 +16,10 @@ const Y_LABEL_WIDTH: u32 = 34;
 const LEGEND_WIDTH: u32 = 250;
 /// Distance between two lines of the legend.
 const LINE_HEIGHT: i32 = 22;
+/// Width of a letter of a label [pixel].
+const LABEL_LETTER: i32 = 6;
+/// Height of a label [pixel].
+const LABEL_HEIGHT: i32 = 10;
 /// Margin around the values, as a fraction of their range.
 const MARGIN: f64 = 0.08;
 const INK: RGBAColor = RGBAColor(0, 0, 0, 0.85);
@@ -135,7 +140,7 @@ where
         panel.front.iter().copied(),
         BLACK.mix(0.35).stroke_width(2),
     ))?;
-    for (index, ScatterPoint { method, colour, label, x, y }) in panel.points.iter().enumerate() {
+    for (index, ScatterPoint { method, colour, x, y, .. }) in panel.points.iter().enumerate() {
         let place = (x.value, y.value);
         let mut later = panel.points[index + 1..].iter();
         if let Some(next) = later.find(|other| other.method == *method) {
@@ -148,12 +153,35 @@ where
         ];
         let bars = bars.map(|ends| PathElement::new(ends, colour.mix(0.6).stroke_width(1)));
         chart.draw_series(bars)?;
-        chart.draw_series([Circle::new(place, 5, colour.filled())])?;
-        if !label.is_empty() {
-            let style = ("sans-serif", 11).into_font().color(&INK);
-            let text = Text::new(label.clone(), (7, -6), style);
-            chart.draw_series([EmptyElement::at(place) + text])?;
+        chart.draw_series([Circle::new(place, 4, colour.filled())])?;
+    }
+    draw_labels(&mut chart, &panel.points)
+}
+
+/// Draws the labels beside their points, without those that would cover another point or label.
+fn draw_labels<DB: DrawingBackend>(
+    chart: &mut ChartContext<'_, DB, Cartesian2d<RangedCoordf64, RangedCoordf64>>,
+    points: &[ScatterPoint],
+) -> Result<(), Box<dyn std::error::Error>>
+where
+    DB::ErrorType: 'static,
+{
+    let place = |point: &ScatterPoint| (point.x.value, point.y.value);
+    let mut taken: Vec<(i32, i32)> =
+        points.iter().map(|point| chart.backend_coord(&place(point))).collect();
+    for (index, point) in points.iter().enumerate() {
+        let (x, y) = taken[index];
+        let width = LABEL_LETTER * point.label.chars().count() as i32;
+        let covers = |other: &(i32, i32)| {
+            (x + 1..x + 7 + width).contains(&other.0) && (other.1 - y).abs() < LABEL_HEIGHT
+        };
+        if point.label.is_empty() || taken.iter().any(covers) {
+            continue;
         }
+        taken.extend([(x + 7, y - 1), (x + 7 + width / 2, y - 1), (x + 7 + width, y - 1)]);
+        let style = ("sans-serif", 11).into_font().color(&INK);
+        let text = Text::new(point.label.clone(), (7, -6), style);
+        chart.draw_series([EmptyElement::at(place(point)) + text])?;
     }
     Ok(())
 }

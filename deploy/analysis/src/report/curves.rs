@@ -75,7 +75,7 @@ fn curve(
     what: &str,
     measure: Measure,
 ) -> anyhow::Result<Option<Picture>> {
-    let lines: Vec<MethodLine> = (0..results.methods.len())
+    let lines: Vec<MethodLine> = (results.shown_methods(task).into_iter())
         .map(|index| MethodLine::new(results, task, index, measure))
         .filter(|line| !line.points.is_empty())
         .collect();

@@ -1,6 +1,15 @@
 //! Groups the methods of a sweep's grid: their labels differ in `key=value` pairs at the end.
 
-use super::layout::distinct;
+/// Returns the distinct values in order.
+pub(super) fn distinct<T: PartialEq>(values: impl IntoIterator<Item = T>) -> Vec<T> {
+    let mut known = Vec::new();
+    for value in values {
+        if !known.contains(&value) {
+            known.push(value);
+        }
+    }
+    known
+}
 
 /// Splits the label of a method, such as `TD3-DMP, exploration.std=0.2`, into the method's name and
 /// the keys with their values.
@@ -10,6 +19,13 @@ pub(super) fn split(label: &str) -> (&str, Vec<(&str, &str)>) {
     let ends = starts.iter().skip(1).copied().chain([label.len()]);
     let pairs = starts.iter().zip(ends).filter_map(|(at, end)| pair(&label[at + 2..end]));
     (&label[..starts.first().copied().unwrap_or(label.len())], pairs.collect())
+}
+
+/// Returns the label of a method with the values of its keys only, such as `TD3-DMP, 0.2`.
+pub(super) fn short(label: &str) -> String {
+    let (name, values) = split(label);
+    let values = values.into_iter().map(|(_, value)| value);
+    std::iter::once(name).chain(values).collect::<Vec<_>>().join(", ")
 }
 
 /// Splits `key=value`. The value may be a list, and so contain commas.
@@ -44,6 +60,7 @@ mod tests {
             split("TD3, policy.hidden=[64, 64], run.steps=5"),
             ("TD3", vec![("policy.hidden", "[64, 64]"), ("run.steps", "5")])
         );
+        assert_eq!(short("DMP, last action, run.steps=5"), "DMP, last action, 5");
     }
 
     #[test]

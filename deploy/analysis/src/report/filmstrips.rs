@@ -11,11 +11,9 @@ use dmprl_run::{RunDirectory, safe_name};
 use dmprl_shared::config::PolicyKind;
 use serde::Serialize;
 
-use super::measures::Measure;
 use super::motion::in_one_line;
 use super::results::Results;
 use super::run::{Run, Source};
-use super::statistics::Summary;
 
 /// The method that the paper's Figure 5 compares with its own.
 const BASELINE: &str = "DDPG";
@@ -155,19 +153,11 @@ pub fn read_filmstrips(planned: &[PlannedFilmstrip]) -> anyhow::Result<Vec<Films
     existing.map(read).collect()
 }
 
-/// Returns the finished run with the lowest seed of the best method with a dmp policy. Methods are
-/// compared by mean success rate, then by mean return.
+/// Returns the finished run with the lowest seed of the best method with a dmp policy.
 fn best_dmp<'r>(results: &'r Results, task: &str) -> Option<&'r Run> {
-    let mean = |method: &str, measure: Measure| {
-        let scores: Vec<f64> = results.of(task, method).filter_map(|run| measure.of(run)).collect();
-        Summary::of(&scores).map(|summary| summary.mean)
-    };
-    let score = |method: &str| {
-        Some((mean(method, Measure::Success).unwrap_or(0.0), mean(method, Measure::Return)?))
-    };
     let candidates = results.methods.iter().filter_map(|method| {
         let run = first_run(results, task, method).filter(|run| run.policy == PolicyKind::Dmp)?;
-        Some((score(method)?, run))
+        Some((results.score(task, method)?, run))
     });
     let best = candidates.max_by(|(a, _), (b, _)| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
     best.map(|(_, run)| run)

@@ -9,6 +9,9 @@ use super::pareto::unbeaten;
 use super::results::Results;
 use super::tables::{Cell, Table};
 
+/// Maximum number of methods that a sentence names.
+const NAMES_MAX: usize = 4;
+
 /// Methods, and the tasks of which the same is true.
 struct Group {
     methods: Vec<String>,
@@ -30,7 +33,7 @@ fn sentence(start: &str, groups: &[Group]) -> Option<String> {
     (!groups.is_empty()).then(|| format!("{start}: {}.", groups.join("; ")))
 }
 
-/// Names those of `methods` for which `is_named` is true.
+/// Names those of `methods` for which `is_named` is true, or counts them if they are many.
 fn named(methods: &[String], is_named: impl Fn(usize) -> bool) -> Vec<String> {
     let quoted = |name: &String| {
         // A comma in a name looks like the end of the name.
@@ -38,10 +41,11 @@ fn named(methods: &[String], is_named: impl Fn(usize) -> bool) -> Vec<String> {
     };
     let named = methods.iter().enumerate().filter(|(index, _)| is_named(*index));
     let names: Vec<String> = named.map(|(_, name)| quoted(name)).collect();
-    if names.len() > 1 && names.len() == methods.len() {
-        return vec!["all methods".to_owned()];
+    match names.len() {
+        count if count > 1 && count == methods.len() => vec!["all methods".to_owned()],
+        count if count > NAMES_MAX => vec![format!("{count} of {} methods", methods.len())],
+        _ => names,
     }
-    names
 }
 
 /// Joins as in a sentence: `a, b and c`.
@@ -210,10 +214,12 @@ mod tests {
     }
 
     #[test]
-    fn names_with_commas_are_quoted_and_all_methods_are_not_listed() {
+    fn names_with_commas_are_quoted_and_many_methods_are_counted() {
         let methods = ["DMP", "DMP, last action", "MLP"].map(str::to_owned);
         assert_eq!(listed(&named(&methods, |index| index < 2)), "DMP and \"DMP, last action\"");
         assert_eq!(named(&methods, |_| true), ["all methods"]);
+        let many: Vec<String> = (0..6).map(|index| index.to_string()).collect();
+        assert_eq!(named(&many, |index| index < 5), ["5 of 6 methods"]);
     }
 
     #[test]

@@ -2,18 +2,8 @@
 
 use serde::Serialize;
 
+use super::families::{self, distinct};
 use super::results::Results;
-
-/// Returns the distinct values in order.
-pub(super) fn distinct<T: PartialEq>(values: impl IntoIterator<Item = T>) -> Vec<T> {
-    let mut known = Vec::new();
-    for value in values {
-        if !known.contains(&value) {
-            known.push(value);
-        }
-    }
-    known
-}
 
 /// A picture.
 #[derive(Debug, Clone, Serialize)]
@@ -49,7 +39,7 @@ pub struct GridRow {
 pub struct GridCell {
     /// Lines of text.
     pub lines: Vec<String>,
-    /// True if it is the best of its row.
+    /// True if it is the best of its task.
     pub is_best: bool,
 }
 
@@ -67,5 +57,71 @@ impl Grid {
             GridRow { name: task.clone(), cells: cells.collect() }
         });
         Self { columns: results.methods.clone(), rows: rows.collect() }
+    }
+
+    /// Moves the values of a sweep's grid from the columns into the rows. The columns are then the
+    /// names of the methods, and each task has a row for each combination of values.
+    #[must_use]
+    pub(super) fn with_values_in_rows(self) -> Self {
+        let columns: Vec<_> = self.columns.iter().map(|label| families::split(label)).collect();
+        let names = families::names(&self.columns);
+        if names.len() == columns.len() {
+            return self;
+        }
+        let combinations = distinct(columns.iter().map(|(_, values)| values));
+        let mut rows = Vec::new();
+        for GridRow { name: task, cells } in &self.rows {
+            rows.extend(combinations.iter().map(|values| {
+                let place =
+                    |name: &str| columns.iter().position(|it| (it.0, &it.1) == (name, values));
+                let cell =
+                    |name: &&str| place(name).map(|at| cells[at].clone()).unwrap_or_default();
+                let values = values.iter().map(|(key, value)| format!(", {key}={value}"));
+                GridRow {
+                    name: std::iter::once(task.clone()).chain(values).collect(),
+                    cells: names.iter().map(cell).collect(),
+                }
+            }));
+        }
+        Self { columns: names.into_iter().map(str::to_owned).collect(), rows }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid(columns: &[&str]) -> Grid {
+        let cells = columns.iter().map(|label| vec![(*label).to_owned()].into()).collect();
+        Grid {
+            columns: columns.iter().map(|&label| label.to_owned()).collect(),
+            rows: vec![GridRow { name: "reacher-v1".to_owned(), cells }],
+        }
+    }
+
+    #[test]
+    fn values_of_a_grid_are_rows() {
+        let labels = ["A, x=1, y=3", "A, x=2, y=3", "B, late, x=2, y=3", "C"];
+        let Grid { columns, rows } = grid(&labels).with_values_in_rows();
+        assert_eq!(columns, ["A", "B, late", "C"]);
+        let rows: Vec<(&str, Vec<String>)> = rows
+            .iter()
+            .map(|row| (&*row.name, row.cells.iter().map(|cell| cell.lines.concat()).collect()))
+            .collect();
+        let cells = |texts: [&str; 3]| texts.map(str::to_owned).to_vec();
+        assert_eq!(
+            rows,
+            [
+                ("reacher-v1, x=1, y=3", cells([labels[0], "", ""])),
+                ("reacher-v1, x=2, y=3", cells([labels[1], labels[2], ""])),
+                ("reacher-v1", cells(["", "", "C"])),
+            ]
+        );
+    }
+
+    #[test]
+    fn a_table_of_different_methods_is_unchanged() {
+        let columns = ["DMP", "DMP, last action", "MLP, x=1"];
+        assert_eq!(grid(&columns).with_values_in_rows().columns, columns);
     }
 }

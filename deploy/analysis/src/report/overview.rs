@@ -3,7 +3,8 @@
 
 use dmprl_run::format::grouped;
 
-use super::layout::{Grid, distinct};
+use super::families::distinct;
+use super::layout::Grid;
 use super::results::Results;
 use super::run::Run;
 

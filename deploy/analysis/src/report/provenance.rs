@@ -5,7 +5,8 @@ use std::collections::BTreeSet;
 
 use serde::Serialize;
 
-use super::layout::{Grid, distinct};
+use super::families::distinct;
+use super::layout::Grid;
 use super::results::Results;
 use super::run::{Origin, Run};
 

@@ -19,7 +19,7 @@ use super::{families, findings, overview, paper};
 
 /// Explains the tables.
 const TABLES_NOTE: &str = "A cell has the mean ± the standard deviation over seeds, rounded to one \
-    or two digits of the latter; the best mean of a row is bold. With four or more seeds, the \
+    or two digits of the latter; the best mean of a task is bold. With four or more seeds, the \
     second line is the interquartile mean (IQM) with its 95 % interval by stratified bootstrap. \
     The bounds of a method are this interval, or with fewer seeds the range over them. figures.csv \
     has all of them unrounded. Only finished runs are included. † marks figures over runs with \
@@ -45,6 +45,9 @@ const FRAMES: &str = "One episode after training, without exploration noise, of 
 /// Explains the joint trajectories.
 const JOINTS: &str = "One episode of each method's policy after training, without exploration \
     noise, reset with the same seed. All panels of a picture have the same axes.";
+/// Explains that pictures of a large grid leave out methods.
+const BEST_SETTINGS: &str = "Of each method, only the values with the best last evaluations are \
+    shown.";
 /// Explains the provenance.
 const PROVENANCE: &str = "Programs and packages that made the runs of each cell, by number, and \
     the seeds with a measured motion and with a recorded rollout.";
@@ -101,6 +104,9 @@ impl Text {
     pub fn of(report: &Report) -> Self {
         let mut text =
             Self { summary: summary(report), main: main(report), details: details(report) };
+        for section in text.main.iter_mut().chain(&mut text.details) {
+            section.grid = section.grid.take().map(Grid::with_values_in_rows);
+        }
         if report.results.methods.iter().any(|method| method == paper::INTERPRETED_METHOD) {
             text.summary.push(paper::INTERPRETATION_NOTE.to_owned());
             let sections = text.main.iter_mut().chain(&mut text.details);
@@ -128,9 +134,9 @@ fn summary(report: &Report) -> Vec<String> {
         });
     let verdicts: Vec<String> = verdicts.collect();
     if !(claims.is_empty() || verdicts.is_empty()) {
-        let count = claims.len();
-        let verdicts = verdicts.join("; ");
-        summary.push(format!("Verdicts on the paper's {count} statements: {verdicts}."));
+        let (count, verdicts) = (claims.len(), verdicts.join("; "));
+        let all = count + report.claims.left_out;
+        summary.push(format!("Verdicts on {count} of the paper's {all} statements: {verdicts}."));
     }
     summary.push(TABLES_NOTE.to_owned());
     summary
@@ -155,6 +161,7 @@ fn main(report: &Report) -> Vec<Section> {
         let mut curves = Section::new(&title("Learning curves", "Figures 3 and 4"), &[CURVES]);
         curves.finding = findings::first_to_threshold(&report.efficiency, &results.methods);
         curves.about.extend(is_papers.then(|| CURVES_OF_PAPER.to_owned()));
+        curves.about.extend(results.shows_best_settings().then(|| BEST_SETTINGS.to_owned()));
         curves.pictures = report.curves.main.clone();
         curves.has_pairs = true;
         sections.push(curves);
@@ -165,8 +172,8 @@ fn main(report: &Report) -> Vec<Section> {
         let keys = families::keys(&results.methods);
         if !keys.is_empty() {
             pareto.about.push(format!(
-                "The numbers beside the points are values of {}. A thin line connects the points \
-                 of a method.",
+                "The numbers beside the points are values of {}, where there is room. A thin \
+                 line connects the points of a method.",
                 keys.join(", ")
             ));
         }
@@ -184,6 +191,7 @@ fn main(report: &Report) -> Vec<Section> {
         let mut joints =
             Section::new(&title("Joints over a rollout", "Figures 6 and 7"), &[JOINTS]);
         joints.finding = findings::joints(results);
+        joints.about.extend(results.shows_best_settings().then(|| BEST_SETTINGS.to_owned()));
         joints.pictures = report.trajectories.clone();
         sections.push(joints);
     }
@@ -279,6 +287,12 @@ fn statements(claims: &PaperClaims) -> Section {
          trained for about 200,000 steps; nothing is extrapolated."
     );
     let mut section = Section::new("Statements of the paper", &[&about]);
+    if claims.left_out > 0 {
+        section.about.push(format!(
+            "{} statements are left out, because a method has no run on their task.",
+            claims.left_out
+        ));
+    }
     section.statements = claims.results.clone();
     section
 }

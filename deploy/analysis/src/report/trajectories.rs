@@ -4,6 +4,7 @@ use anyhow::anyhow;
 use dmprl_run::safe_name;
 use plotters::style::RGBColor;
 
+use super::families;
 use super::layout::Picture;
 use super::motion_metrics::Rollout;
 use super::results::{Results, ShownRollout};
@@ -51,7 +52,8 @@ pub fn missing_trajectories(results: &Results) -> Vec<String> {
     let mut missing = Vec::new();
     for task in &results.tasks {
         let shown = results.shown_rollouts(task);
-        for method in &results.methods {
+        for index in results.shown_methods(task) {
+            let method = &results.methods[index];
             let had_joints = |run: &Run| {
                 let jerk = run.motion.as_ref().and_then(|motion| motion.joint_jerk);
                 run.directory().is_none() && jerk.is_some()
@@ -86,7 +88,7 @@ fn panel(
         times.iter().copied().zip(rows.iter().map(|row| row[joint])).collect()
     };
     Panel {
-        title: format!("{}, seed {}", run.method, run.seed),
+        title: format!("{}, seed {}", families::short(&run.method), run.seed),
         colour: colours[*method_index],
         lines: (0..rollout.joints.len()).map(line).collect(),
     }

@@ -57,24 +57,33 @@ pub struct ClaimResult {
 pub struct PaperClaims {
     /// Limits used by the rules.
     pub limits: Limits,
-    /// The statements, in the paper's order; empty if none of the tasks is in the paper.
+    /// The statements whose methods have runs, in the paper's order.
     pub results: Vec<ClaimResult>,
+    /// Number of statements left out, because a method has no run on their task.
+    pub left_out: usize,
 }
 
-/// Evaluates all statements if any of the tasks is in the paper.
+/// Evaluates the statements whose methods have runs on their task.
 ///
 /// # Errors
 /// The embedded statements cannot be parsed, which is not expected.
 pub fn evaluate_statements(results: &Results) -> anyhow::Result<PaperClaims> {
     let PaperStatements { limits, statements } = PaperStatements::read()?;
-    if !statements.iter().any(|statement| results.tasks.contains(&statement.task)) {
-        return Ok(PaperClaims { limits, results: Vec::new() });
-    }
+    let count = statements.len();
     let estimates = Estimates::new(results);
     let labels: Vec<&'static str> =
         SUBJECTS.into_iter().filter(|label| results.methods.iter().any(|it| it == label)).collect();
-    let evaluate = |statement| evaluate(statement, &estimates, limits, &labels);
-    Ok(PaperClaims { limits, results: statements.into_iter().map(evaluate).collect() })
+    let has_runs = |task: &str, method: &str| results.of(task, method).next().is_some();
+    let is_of_runs = |Statement { task, rule, .. }: &Statement| {
+        rule.methods().into_iter().all(|method| match method {
+            PROPOSED => labels.iter().any(|label| has_runs(task, label)),
+            label => has_runs(task, label),
+        })
+    };
+    let kept = statements.into_iter().filter(is_of_runs);
+    let results: Vec<ClaimResult> =
+        kept.map(|statement| evaluate(statement, &estimates, limits, &labels)).collect();
+    Ok(PaperClaims { limits, left_out: count - results.len(), results })
 }
 
 /// Evaluates a statement.
@@ -89,8 +98,6 @@ fn evaluate(
     let contradiction = contradictions::of(&statement);
     let subjects: Vec<Option<&'static str>> = if !statement.rule.is_about_proposed() {
         vec![None]
-    } else if labels.is_empty() {
-        vec![Some(SUBJECTS[0])]
     } else {
         labels.iter().copied().map(Some).collect()
     };

@@ -127,27 +127,31 @@ pub(super) struct ReportedSteps {
 }
 
 impl Rule {
-    /// Returns true if the rule involves the paper's own method.
-    pub(super) fn is_about_proposed(&self) -> bool {
-        match self {
+    /// Returns the labels of the methods that the rule compares, [`PROPOSED`] for the paper's own.
+    pub(super) fn methods(&self) -> Vec<&str> {
+        let (one, others): (Option<&String>, Vec<&String>) = match self {
             Self::Better { method, than, .. } | Self::Sooner { method, than, .. } => {
-                method == PROPOSED || names_proposed(than)
+                (Some(method), than.iter().collect())
             }
-            Self::BetterBy { method, .. }
-            | Self::Within { method, .. }
-            | Self::Fails { method, .. }
-            | Self::Spread { method } => method == PROPOSED,
+            Self::BetterBy { method, margins } => {
+                (Some(method), margins.iter().map(|margin| &margin.than).collect())
+            }
+            Self::Within { method, .. } | Self::Fails { method, .. } | Self::Spread { method } => {
+                (Some(method), Vec::new())
+            }
             Self::Alike { methods, .. }
             | Self::NoneWithin { methods, .. }
             | Self::Succeeds { methods }
             | Self::Unimproved { methods }
-            | Self::Falls { methods, .. } => names_proposed(methods),
-        }
+            | Self::Falls { methods, .. } => (None, methods.iter().collect()),
+        };
+        one.into_iter().chain(others).map(String::as_str).collect()
     }
-}
 
-fn names_proposed(methods: &[String]) -> bool {
-    methods.iter().any(|method| method == PROPOSED)
+    /// Returns true if the rule involves the paper's own method.
+    pub(super) fn is_about_proposed(&self) -> bool {
+        self.methods().contains(&PROPOSED)
+    }
 }
 
 #[cfg(test)]
@@ -177,25 +181,7 @@ mod tests {
         let is_known =
             |method: &str| method == PROPOSED || SWEEP.contains(&format!("label = \"{method}\""));
         for Statement { id, rule, .. } in PaperStatements::read().unwrap().statements {
-            let methods: Vec<String> = match rule {
-                Rule::Better { method, than, .. } | Rule::Sooner { method, than, .. } => {
-                    [vec![method], than].concat()
-                }
-                Rule::BetterBy { method, margins } => {
-                    let others = margins.into_iter().map(|margin| margin.than);
-                    std::iter::once(method).chain(others).collect()
-                }
-                Rule::Within { method, .. }
-                | Rule::Fails { method, .. }
-                | Rule::Spread { method } => {
-                    vec![method]
-                }
-                Rule::Alike { methods, .. }
-                | Rule::NoneWithin { methods, .. }
-                | Rule::Succeeds { methods }
-                | Rule::Unimproved { methods }
-                | Rule::Falls { methods, .. } => methods,
-            };
+            let methods = rule.methods();
             let unknown: Vec<_> = methods.iter().filter(|method| !is_known(method)).collect();
             assert!(unknown.is_empty(), "{id}: {unknown:?}");
         }
