@@ -11,6 +11,8 @@ The state after t steps is at step t, and so is the reward for reaching it:
 ``episode_SEED/command/action[i]``      in the environment's units, at the step that it starts
 ``episode_SEED/reward``, ``…/return``   after each step; the return so far also before the first
 ``episode_SEED/success``                0 or 1 after each step, if the task reports it
+``episode_SEED/joint/position``,        of the robot's joints [rad or m, and per second], one entity
+``…/velocity``                          for each joint, before the first step and after each
 ``episode_SEED/camera``                 a JPEG for each frame
 ``episode_SEED/segment/index``          number of each segment, at its first step
 ``episode_SEED/segment/start``,         of the movement primitives, at the first step, if the
@@ -63,10 +65,12 @@ class EpisodeLog:
     """Logs an episode below the entity ``root``."""
 
     def __init__(
-        self, stream: rr.RecordingStream, root: Sequence[str], episode: dict, dt: float
+        self, stream: rr.RecordingStream, root: Sequence[str], episode: dict, robot: dict
     ) -> None:
         self.root = root
-        self._stream, self._episode, self._dt = stream, episode, dt
+        self._stream, self._episode, self._dt = stream, episode, robot["control_dt_s"]
+        # Of a task whose joints are unknown, there are neither names nor rows.
+        self._joints = [joint["name"] for joint in robot["joints"]]
         self._details = episode["details"]
         self._frames = list(
             zip(episode.get("frames", []), episode.get("frame_steps", []), strict=True)
@@ -81,6 +85,11 @@ class EpisodeLog:
     def has_primitives(self) -> bool:
         """Whether the policy has movement primitives."""
         return self._details["segments"][0]["primitives"] is not None
+
+    @property
+    def has_joints(self) -> bool:
+        """Whether the robot's joints are known."""
+        return bool(self._joints)
 
     @property
     def frame_count(self) -> int:
@@ -102,6 +111,11 @@ class EpisodeLog:
         self._columns(["command"], actions(commands), states[:-1], commands)
         self._scalars(["reward"], states[1:], rewards)
         self._scalars(["return"], states, np.concatenate([[0.0], np.cumsum(rewards)]))
+        if self.has_joints:
+            keys = {"position": "joint_positions", "velocity": "joint_velocities"}
+            for quantity, key in keys.items():
+                rows = np.array(self._episode[key])
+                self._columns(["joint", quantity], self._joints, states, rows)
         success = self._episode["success_by_step"]
         reported = np.array([flag is not None for flag in success], bool)
         if reported.any():
@@ -192,11 +206,11 @@ def jpeg(file: str) -> bytes:
     return contents.getvalue()
 
 
-def read(side: Side) -> tuple[float, list[dict]]:
-    """Reads the duration of a step [s] and the episodes of a run."""
+def read(side: Side) -> tuple[dict, list[dict]]:
+    """Reads the robot and the episodes of a run."""
     with open(side["episodes"], encoding="utf-8") as file:
         robot, *episodes = map(json.loads, file)
-    return robot["control_dt_s"], episodes
+    return robot, episodes
 
 
 def roots(sides: list[Side]) -> list[list[str]]:
@@ -220,6 +234,8 @@ def views(log: EpisodeLog, title: str) -> rrb.Container:
     if log.has_primitives:
         planned = ["segment/position", "segment/goal", "segment/start"]
         plots.insert(1, plot("planned segments", *planned))
+    if log.has_joints:
+        plots.append(plot("joint velocities", "joint/velocity"))
     plots.append(plot("reward, return and success", "reward", "return", "success"))
     picture = rrb.Spatial2DView(name=title, origin=log.path("camera"))
     return rrb.Horizontal(picture, rrb.Vertical(*plots), name=title)
@@ -246,9 +262,9 @@ def main() -> None:
     stream = rr.RecordingStream(f"{APPLICATION} {output.stem}")
     logs = []
     for side, root in zip(plan["sides"], roots(plan["sides"]), strict=True):
-        dt, episodes = read(side)
+        robot, episodes = read(side)
         logs.append(
-            [EpisodeLog(stream, [*root, f"episode_{it['seed']}"], it, dt) for it in episodes]
+            [EpisodeLog(stream, [*root, f"episode_{it['seed']}"], it, robot) for it in episodes]
         )
     titles = [side["title"] for side in plan["sides"]]
     stream.save(output, blueprint(logs, titles))

@@ -99,6 +99,13 @@ class RerunLog(unittest.TestCase):
             np.testing.assert_allclose(log["reward"].values, rewards, atol=1e-9)
             returns = np.concatenate([[0.0], np.cumsum(rewards)])
             np.testing.assert_allclose(log["return"].values, returns, atol=1e-9)
+            # The reacher observes cosines of its joints, and their velocities.
+            position, velocity = log["joint/position/joint0"], log["joint/velocity/joint0"]
+            self.assertEqual(position.steps, list(range(STEPS + 1)))
+            cosines = observations[:, names.index("cos_joint0")]
+            np.testing.assert_allclose(np.cos(position.values), cosines, atol=1e-9)
+            velocities = observations[:, names.index("velocity_joint0")]
+            np.testing.assert_allclose(velocity.values, velocities, atol=1e-9)
 
     def replay(self, env, seed, commands):
         """Runs an episode with given commands; returns its observations and rewards."""
@@ -141,7 +148,7 @@ class RerunLog(unittest.TestCase):
             Image.new("RGB", (64, 48), (30 * step, 0, 0)).save(file)
             episode["frames"].append(str(file))
             episode["frame_steps"].append(step)
-        robot = {**self.robot, "control_dt_s": 0.0}
+        robot = {**self.robot, "control_dt_s": 0.0, "joints": []}
         log, progress = write(self.folder, [("run", [robot, episode])])
         success = log["/episode_1000/success"]
         self.assertEqual((success.steps, success.seconds), ([2, 3, 4, 5, 6, 7], []))
@@ -154,6 +161,7 @@ class RerunLog(unittest.TestCase):
         with Image.open(io.BytesIO(bytes(last["EncodedImage:blob"][0]))) as picture:
             self.assertEqual((picture.format, picture.size), ("JPEG", (64, 48)))
             self.assertLess(abs(picture.getpixel((5, 5))[0] - 210), 5)
+        self.assertFalse([path for path in log if "/joint/" in path])
         self.assertEqual(progress[-1], {"done": 2, "of": 2})
         self.assertTrue(all(report["done"] < 2 for report in progress[:-1]))
 
