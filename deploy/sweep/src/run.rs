@@ -241,11 +241,11 @@ fn check_same(
     let differing = expected.keys().chain(found.keys()).find_map(|key| {
         let (there, here) = (found.get(key), expected.get(key));
         let (there_text, here_text) = (text(there), text(here));
-        (there != here)
-            .then(|| format!("{key} is {there_text} there and {here_text} in the sweep file"))
+        (there != here).then(|| format!("{key} is {there_text} there and {here_text} in the sweep"))
     });
     anyhow::bail!(
-        "{} was trained with another configuration: {}; remove it, or choose another --output",
+        "{} was trained with another configuration: {}; set the same in the sweep file (a default \
+         may have changed with the program), remove the run, or choose another --output",
         shown(path),
         differing.unwrap_or_default()
     )

@@ -160,5 +160,5 @@ fn a_sweep_varies_an_argument() {
     let text = fs::read_to_string(&file).unwrap();
     fs::write(&file, text.replace("max_episode_steps = 10", "max_episode_steps = 9")).unwrap();
     let refused = place.run(&["sweep", &file]).with_status(1);
-    refused.saying("task.kwargs.max_episode_steps is 10 there and 9 in the sweep file");
+    refused.saying("task.kwargs.max_episode_steps is 10 there and 9 in the sweep");
 }
