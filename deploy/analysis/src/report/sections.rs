@@ -296,3 +296,26 @@ fn statements(claims: &PaperClaims) -> Section {
     section.statements = claims.results.clone();
     section
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::fixtures::{FixtureRun, fixture_results};
+    use super::super::statements::evaluate_statements;
+    use super::*;
+
+    #[test]
+    fn statements_about_methods_without_runs_are_counted() {
+        let run = FixtureRun {
+            task: "reacher-v1",
+            method: "NDP",
+            seed: 1,
+            rows: vec![-20.0, -15.0],
+            ended: true,
+        };
+        let section = statements(&evaluate_statements(&fixture_results(&[run])).unwrap());
+        let claims: Vec<&str> = section.statements.iter().map(|it| it.claim.as_str()).collect();
+        assert_eq!(claims, ["NDP's learning curve shows no improvement"]);
+        let left_out = "33 statements are left out, because a method has no run on their task.";
+        assert_eq!(section.about[1], left_out);
+    }
+}
