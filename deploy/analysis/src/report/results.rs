@@ -74,9 +74,13 @@ impl Results {
         }
         let name = |index: usize| families::split(&self.methods[index]).0;
         let best_of = |of: &str| {
-            let settings = (0..self.methods.len()).filter(|index| name(*index) == of);
-            let scored =
-                settings.filter_map(|index| Some((self.score(task, &self.methods[index])?, index)));
+            let has_run = |index: usize| self.of(task, &self.methods[index]).next().is_some();
+            let settings =
+                (0..self.methods.len()).filter(|index| name(*index) == of && has_run(*index));
+            // While no run is finished, any setting is as good as another.
+            let worst = (0.0, f64::NEG_INFINITY);
+            let scored = settings
+                .map(|index| (self.score(task, &self.methods[index]).unwrap_or(worst), index));
             // Of equal ones the first.
             scored.rev().max_by(|(a, _), (b, _)| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)))
         };
@@ -146,6 +150,9 @@ mod tests {
         assert!(results.shown_methods("reacher-v1").is_empty(), "no run");
         let colours = results.colours();
         assert!(colours[0] == colours[4] && colours[4] != colours[5]);
+        let mut unfinished = results.clone();
+        unfinished.runs.iter_mut().for_each(|run| run.ended = false);
+        assert_eq!(unfinished.shown_methods("pusher-v0"), [0, 5]);
         let mut few = results;
         few.methods.truncate(8);
         assert_eq!(few.shown_methods("pusher-v0"), [0, 1, 2, 3, 4, 5, 6, 7]);
