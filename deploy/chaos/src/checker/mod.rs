@@ -56,7 +56,8 @@ pub(super) struct Checker {
     /// later learner has rolled back.
     checkpoint_counters: Vec<LearnerCounters>,
     /// Environment steps since the last checkpoint was begun or the learner started to serve.
-    steps_since_checkpoint: u64,
+    /// `None` while a learner reads its log, which no checkpoint interrupts.
+    steps_since_checkpoint: Option<u64>,
     checkpoint_interval: u64,
     /// Epoch of each worker's newest policy.
     epochs: Vec<u64>,
@@ -73,7 +74,7 @@ impl Checker {
             settled: vec![Watermark::default(); count],
             counters: LearnerCounters::default(),
             checkpoint_counters: vec![LearnerCounters::default()],
-            steps_since_checkpoint: 0,
+            steps_since_checkpoint: None,
             checkpoint_interval,
             epochs: vec![0; count],
             duplicate: 0,
@@ -97,7 +98,7 @@ impl Checker {
             (Author::Learner(deaths), Entry::Started(counters)) => {
                 self.on_started(deaths, counters);
             }
-            (Author::Learner(_), Entry::Serving) => self.steps_since_checkpoint = 0,
+            (Author::Learner(_), Entry::Serving) => self.steps_since_checkpoint = Some(0),
             (Author::Learner(_), Entry::Inserted(segment)) => self.on_inserted(&segment),
             (Author::Learner(_), Entry::Rejected { is_duplicate: true, .. }) => self.duplicate += 1,
             (Author::Learner(_), Entry::Rejected { segment, is_duplicate: false }) => {
@@ -106,7 +107,7 @@ impl Checker {
             (Author::Learner(_), Entry::CheckpointBegun(counters)) => {
                 self.checkpoint_counters.push(counters);
                 self.checkpoints += 1;
-                self.steps_since_checkpoint = 0;
+                self.steps_since_checkpoint = Some(0);
             }
             (author, entry) => {
                 self.violations
@@ -228,7 +229,7 @@ impl Checker {
             }
         }
         self.counters = counters;
-        self.steps_since_checkpoint = 0;
+        self.steps_since_checkpoint = None;
     }
 
     fn on_inserted(&mut self, segment: &SegmentDigest) {
@@ -238,10 +239,11 @@ impl Checker {
         self.settled[segment.worker as usize] = mark;
         self.counters.segments += 1;
         self.counters.env_steps += segment.env_steps;
-        let before = self.steps_since_checkpoint;
-        self.steps_since_checkpoint += segment.env_steps;
+        let Some(steps) = &mut self.steps_since_checkpoint else { return };
+        let before = *steps;
+        *steps += segment.env_steps;
         let limit = INTERVALS_MAX * self.checkpoint_interval + SEGMENT_STEPS;
-        if before <= limit && self.steps_since_checkpoint > limit {
+        if before <= limit && *steps > limit {
             self.violations.add(format!("I5: no checkpoint was begun within {limit} steps"));
         }
     }

@@ -43,12 +43,17 @@ impl JournalScript {
 
     /// Starts a learner from a checkpoint with these marks and this number of segments.
     fn start_learner(&mut self, deaths: u64, marks: [Watermark; 2], segments: u64) {
+        self.restore_learner(deaths, marks, segments);
+        self.note_learner(Entry::Serving);
+    }
+
+    /// Starts a learner, which has yet to read its log.
+    fn restore_learner(&mut self, deaths: u64, marks: [Watermark; 2], segments: u64) {
         self.learner = Author::Learner(deaths);
         for (worker, mark) in (0..).zip(marks) {
             self.note_learner(Entry::Restored(worker, mark));
         }
         self.note_learner(Entry::Started(counters_after(segments)));
-        self.note_learner(Entry::Serving);
     }
 
     fn produce(&mut self, worker: u32, incarnation: u32, sequences: std::ops::RangeInclusive<u64>) {
@@ -263,6 +268,23 @@ fn i5_missing_checkpoints_are_found() {
     script.produce(0, 0, 1..=segments);
     script.insert(0, 0, 1..=segments);
     script.expect_violation("I5", "no checkpoint was begun within 300 steps");
+}
+
+/// If each learner dies before its first checkpoint is written, the log gets longer than the limit.
+#[test]
+fn i5_segments_read_from_the_log_need_no_checkpoint() {
+    let mut script = JournalScript::new();
+    let segments = 2 * INTERVAL / STEPS;
+    script.produce(0, 0, 1..=2 * segments);
+    script.insert(0, 0, 1..=segments);
+    script.restore_learner(1, [mark(0, 0), mark(0, 0)], 0);
+    script.insert(0, 0, 1..=segments);
+    script.note_learner(Entry::Serving);
+    script.insert(0, 0, segments + 1..=2 * segments);
+    script.restore_learner(2, [mark(0, 0), mark(0, 0)], 0);
+    script.insert(0, 0, 1..=2 * segments);
+    script.note_learner(Entry::Serving);
+    assert_eq!(script.end().1, Vec::<String>::new());
 }
 
 #[test]
