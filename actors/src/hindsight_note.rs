@@ -1,6 +1,6 @@
 //! The line that a worker prints about hindsight at its start.
 
-use dmprl_shared::config::ExperimentConfig;
+use dmprl_shared::config::{CriticInput, ExperimentConfig};
 use dmprl_shared::goal_rule::{GoalReward, GoalRule};
 
 /// The source of an environment's rewards for goals.
@@ -29,7 +29,7 @@ pub(crate) fn hindsight_note(
             Some(format!(
                 "hindsight draws goals for each batch; a goal is reached within {threshold} of it"
             )),
-            None,
+            settings_for_segment_critics(config),
         ),
         GoalRewards::Rule(_) => (
             Some("hindsight draws goals for each batch, with rewards by distance".to_owned()),
@@ -55,21 +55,37 @@ pub(crate) fn hindsight_note(
     (!parts.is_empty()).then(|| parts.join("; "))
 }
 
+/// Names the settings that are set and need critics of whole segments, if the critics see only the
+/// first action.
+fn settings_for_segment_critics(config: &ExperimentConfig) -> Option<String> {
+    let algorithm = &config.algorithm;
+    let settings = [
+        ("algorithm.imitation_penalty", algorithm.imitation_penalty > 0.0),
+        ("algorithm.outcome_model", algorithm.outcome_model),
+    ];
+    let condition = "with algorithm.critic = \"first\"";
+    (algorithm.critic == CriticInput::First).then(|| no_effect(condition, &settings)).flatten()
+}
+
 /// Names the settings that are set and have no effect under a condition: all that need a rule for
 /// goals, or with `only_sparse` only those that need a sparse one.
 fn idle_settings(config: &ExperimentConfig, condition: &str, only_sparse: bool) -> Option<String> {
     let ExperimentConfig { algorithm, replay, .. } = config;
-    let names: Vec<&str> = [
+    let settings = [
         ("algorithm.imitation_penalty", algorithm.imitation_penalty > 0.0),
         ("algorithm.motion_bonus", algorithm.motion_bonus > 0.0),
         ("algorithm.outcome_model", algorithm.outcome_model),
         ("replay.moved_share", replay.moved_share > 0.0),
         ("replay.other_goals_share", !only_sparse && replay.other_goals_share > 0.0),
         ("replay.near_misses_share", !only_sparse && replay.near_misses_share > 0.0),
-    ]
-    .into_iter()
-    .filter_map(|(name, is_set)| is_set.then_some(name))
-    .collect();
+    ];
+    no_effect(condition, &settings)
+}
+
+/// Says that those of the settings that are set have no effect.
+fn no_effect(condition: &str, settings: &[(&str, bool)]) -> Option<String> {
+    let names: Vec<&str> =
+        settings.iter().filter(|(_, is_set)| *is_set).map(|(name, _)| *name).collect();
     (!names.is_empty()).then(|| format!("no effect {condition}: {}", names.join(", ")))
 }
 
@@ -118,6 +134,17 @@ mod tests {
         }
         let note = hindsight_note(&config, GoalRewards::Rule(&dense)).unwrap();
         assert!(!note.contains("near_misses"), "{note}");
+    }
+
+    #[test]
+    fn settings_for_critics_of_whole_segments_are_named() {
+        let mut config = with_goal_settings();
+        config.algorithm.critic = CriticInput::First;
+        let sparse = rule(GoalReward::Sparse { threshold: 0.05, reached: 0.0, missed: -1.0 });
+        let note = hindsight_note(&config, GoalRewards::Rule(&sparse)).unwrap();
+        let expected = "; no effect with algorithm.critic = \"first\": \
+                        algorithm.imitation_penalty, algorithm.outcome_model";
+        assert!(note.ends_with(expected), "{note}");
     }
 
     #[test]
