@@ -10,7 +10,7 @@ use plotters::prelude::*;
 /// Margin above and below the values, as a fraction of their range.
 const MARGIN: f64 = 0.05;
 
-/// A chart over environment steps.
+/// A chart with numbers on both axes.
 pub(crate) type Chart<'a, 'b> =
     ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 

@@ -3,6 +3,7 @@
 mod axes;
 mod colours;
 mod learning_curve;
+mod panels;
 mod png;
 mod scatter;
 mod small_multiples;

@@ -1,28 +1,19 @@
 //! Draws scatter plots side by side with one vertical axis: a point with bars for each method, and
 //! a line through the points that no other point beats in both directions.
 
-use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
-/// Maximum number of panels in a row.
-const COLUMNS_MAX: usize = 2;
-/// Size of a panel, including its labels.
-const PANEL: (u32, u32) = (380, 280);
-/// Space for the title above all panels.
-const TITLE_HEIGHT: u32 = 44;
-/// Space for the label of the vertical axis.
-const Y_LABEL_WIDTH: u32 = 34;
-/// Space for the legend.
-const LEGEND_WIDTH: u32 = 250;
-/// Distance between two lines of the legend.
-const LINE_HEIGHT: i32 = 22;
+use super::axes::Chart;
+use super::panels::{Area, INK, LINE_HEIGHT, PanelLayout, write};
+
+const LAYOUT: PanelLayout =
+    PanelLayout { columns_max: 2, panel: (380, 280), bottom_height: 0, legend_width: 250 };
 /// Width of a letter of a label [pixel].
 const LABEL_LETTER: i32 = 6;
 /// Height of a label [pixel].
 const LABEL_HEIGHT: i32 = 10;
 /// Margin around the values, as a fraction of their range.
 const MARGIN: f64 = 0.08;
-const INK: RGBAColor = RGBAColor(0, 0, 0, 0.85);
 
 /// A value with its bounds.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -73,44 +64,22 @@ pub(crate) struct Scatter<'t> {
 impl Scatter<'_> {
     /// Draws the figure as SVG.
     pub(crate) fn draw(&self) -> Result<String, Box<dyn std::error::Error>> {
-        let columns = self.panels.len().clamp(1, COLUMNS_MAX);
-        let rows = self.panels.len().div_ceil(columns);
-        let inner = (PANEL.0 * columns as u32, PANEL.1 * rows as u32);
-        let size = (Y_LABEL_WIDTH + inner.0 + LEGEND_WIDTH, TITLE_HEIGHT + inner.1);
-        let mut svg = String::new();
-        {
-            let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
-            area.fill(&WHITE)?;
-            let title = ("sans-serif", 20).into_font().color(&INK);
-            area.draw_text(self.title, &title, ((Y_LABEL_WIDTH + 16) as i32, 10))?;
-            let upright =
-                ("sans-serif", 16).into_font().transform(FontTransform::Rotate270).color(&INK);
-            let middle = (TITLE_HEIGHT + inner.1 / 2 + 40) as i32;
-            area.draw_text(self.y_label, &upright, (10, middle))?;
-            let panels = area.margin(TITLE_HEIGHT, 0, Y_LABEL_WIDTH, LEGEND_WIDTH);
-            for (panel, cell) in self.panels.iter().zip(&panels.split_evenly((rows, columns))) {
+        LAYOUT.draw(self.title, self.y_label, self.panels.len(), |picture| {
+            for (panel, cell) in self.panels.iter().zip(&picture.cells) {
                 draw_panel(cell, panel)?;
             }
-            let x = (Y_LABEL_WIDTH + inner.0 + 16) as i32;
-            for (index, (name, colour)) in self.legend.iter().enumerate() {
-                let y = (TITLE_HEIGHT + 16) as i32 + index as i32 * LINE_HEIGHT;
-                area.draw(&Circle::new((x + 6, y), 5, colour.filled()))?;
-                let style = ("sans-serif", 14).into_font().color(&INK);
-                area.draw_text(name, &style, (x + 20, y - 7))?;
+            let [x, y] = picture.legend;
+            for ((name, colour), line) in self.legend.iter().zip(0..) {
+                let y = y + line * LINE_HEIGHT;
+                picture.area.draw(&Circle::new((x + 6, y + 7), 5, colour.filled()))?;
+                write(picture.area, name, 14, [x + 20, y])?;
             }
-            area.present()?;
-        }
-        Ok(svg)
+            Ok(())
+        })
     }
 }
 
-fn draw_panel<DB: DrawingBackend>(
-    area: &DrawingArea<DB, plotters::coord::Shift>,
-    panel: &ScatterPanel,
-) -> Result<(), Box<dyn std::error::Error>>
-where
-    DB::ErrorType: 'static,
-{
+fn draw_panel(area: &Area<'_>, panel: &ScatterPanel) -> Result<(), Box<dyn std::error::Error>> {
     let range = |of: fn(&ScatterPoint) -> Bounded| {
         let bounds = || panel.points.iter().flat_map(move |point| of(point).bounds);
         let low = bounds().fold(f64::INFINITY, f64::min);
@@ -159,13 +128,10 @@ where
 }
 
 /// Draws the labels beside their points, without those that would cover another point or label.
-fn draw_labels<DB: DrawingBackend>(
-    chart: &mut ChartContext<'_, DB, Cartesian2d<RangedCoordf64, RangedCoordf64>>,
+fn draw_labels(
+    chart: &mut Chart<'_, '_>,
     points: &[ScatterPoint],
-) -> Result<(), Box<dyn std::error::Error>>
-where
-    DB::ErrorType: 'static,
-{
+) -> Result<(), Box<dyn std::error::Error>> {
     let place = |point: &ScatterPoint| (point.x.value, point.y.value);
     let mut taken: Vec<(i32, i32)> =
         points.iter().map(|point| chart.backend_coord(&place(point))).collect();

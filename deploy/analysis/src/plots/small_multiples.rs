@@ -2,23 +2,12 @@
 
 use plotters::prelude::*;
 
-/// Maximum number of panels in a row.
-const COLUMNS_MAX: usize = 4;
-/// Size of a panel, including its labels.
-const PANEL: (u32, u32) = (270, 210);
-/// Space for the title above all panels.
-const TITLE_HEIGHT: u32 = 44;
-/// Space for the label of the horizontal axis below all panels.
-const X_LABEL_HEIGHT: u32 = 40;
-/// Space for the label of the vertical axis.
-const Y_LABEL_WIDTH: u32 = 34;
-/// Space for the legend.
-const LEGEND_WIDTH: u32 = 190;
-/// Distance between two lines of the legend.
-const LINE_HEIGHT: i32 = 22;
+use super::panels::{Area, LINE_HEIGHT, PanelLayout, write};
+
+const LAYOUT: PanelLayout =
+    PanelLayout { columns_max: 4, panel: (270, 210), bottom_height: 40, legend_width: 190 };
 /// Margin above and below the values, as a fraction of their range.
 const MARGIN: f64 = 0.05;
-const INK: RGBAColor = RGBAColor(0, 0, 0, 0.85);
 /// Tol's "bright" scheme, distinguishable with all common types of colour vision and different from
 /// the methods' colours. The grey is darker here, for a white background.
 const COLOURS: [RGBColor; 7] = [
@@ -63,54 +52,32 @@ pub(crate) struct SmallMultiples<'t> {
 impl SmallMultiples<'_> {
     /// Draws the figure as SVG.
     pub(crate) fn draw(&self) -> Result<String, Box<dyn std::error::Error>> {
-        let columns = self.panels.len().clamp(1, COLUMNS_MAX);
-        let rows = self.panels.len().div_ceil(columns);
-        let inner = (PANEL.0 * columns as u32, PANEL.1 * rows as u32);
-        let size =
-            (Y_LABEL_WIDTH + inner.0 + LEGEND_WIDTH, TITLE_HEIGHT + inner.1 + X_LABEL_HEIGHT);
-        let mut svg = String::new();
-        {
-            let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
-            area.fill(&WHITE)?;
-            let words = |text: &str, points: u32, at: (u32, u32)| {
-                let style = ("sans-serif", points).into_font().color(&INK);
-                area.draw_text(text, &style, (at.0 as i32, at.1 as i32))
-            };
-            words(self.title, 20, (Y_LABEL_WIDTH + 16, 10))?;
-            let below = TITLE_HEIGHT + inner.1 + 10;
-            words(self.axes[0], 16, (Y_LABEL_WIDTH + inner.0 / 2, below))?;
-            let upright =
-                ("sans-serif", 16).into_font().transform(FontTransform::Rotate270).color(&INK);
-            let middle = (TITLE_HEIGHT + inner.1 / 2 + 60) as i32;
-            area.draw_text(self.axes[1], &upright, (10, middle))?;
-            let panels = area.margin(TITLE_HEIGHT, X_LABEL_HEIGHT, Y_LABEL_WIDTH, LEGEND_WIDTH);
-            let cells = panels.split_evenly((rows, columns));
-            for (index, (panel, cell)) in self.panels.iter().zip(&cells).enumerate() {
-                let tick_labels =
-                    TickLabels { x: index + columns >= self.panels.len(), y: index % columns == 0 };
-                self.draw_panel(cell, panel, tick_labels)?;
+        let count = self.panels.len();
+        LAYOUT.draw(self.title, self.axes[1], count, |picture| {
+            write(picture.area, self.axes[0], 16, picture.bottom)?;
+            for (index, (panel, cell)) in self.panels.iter().zip(&picture.cells).enumerate() {
+                let x = index + picture.columns >= count;
+                let y = index % picture.columns == 0;
+                self.draw_panel(cell, panel, TickLabels { x, y })?;
             }
-            let x = (Y_LABEL_WIDTH + inner.0 + 16) as i32;
-            for (index, name) in self.names.iter().enumerate() {
-                let y = (TITLE_HEIGHT + 12) as i32 + index as i32 * LINE_HEIGHT;
+            let [x, y] = picture.legend;
+            for (index, (name, line)) in self.names.iter().zip(0..).enumerate() {
+                let y = y + line * LINE_HEIGHT;
                 let stroke = vec![(x, y + 7), (x + 22, y + 7)];
-                area.draw(&PathElement::new(stroke, line_colour(index).stroke_width(3)))?;
-                words(name, 14, ((x + 28) as u32, y as u32))?;
+                let style = line_colour(index).stroke_width(3);
+                picture.area.draw(&PathElement::new(stroke, style))?;
+                write(picture.area, name, 14, [x + 28, y])?;
             }
-            area.present()?;
-        }
-        Ok(svg)
+            Ok(())
+        })
     }
 
-    fn draw_panel<DB: DrawingBackend>(
+    fn draw_panel(
         &self,
-        area: &DrawingArea<DB, plotters::coord::Shift>,
+        area: &Area<'_>,
         panel: &Panel,
         tick_labels: TickLabels,
-    ) -> Result<(), Box<dyn std::error::Error>>
-    where
-        DB::ErrorType: 'static,
-    {
+    ) -> Result<(), Box<dyn std::error::Error>> {
         let [x, y] = self.ranges();
         let mut chart = ChartBuilder::on(area)
             .margin(8)
@@ -136,10 +103,8 @@ impl SmallMultiples<'_> {
             let stroke = line_colour(index).stroke_width(2);
             chart.draw_series(LineSeries::new(line.iter().copied(), stroke))?;
         }
-        let style = ("sans-serif", 15).into_font().color(&INK);
         area.draw(&Rectangle::new([(52, 9), (64, 21)], panel.colour.filled()))?;
-        area.draw_text(&panel.title, &style, (70, 7))?;
-        Ok(())
+        write(area, &panel.title, 15, [70, 7])
     }
 
     /// Returns the ranges of both axes over all panels.
