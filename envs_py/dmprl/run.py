@@ -65,15 +65,16 @@ class Run:
     def policy(self, which: str | int = "best") -> Policy:
         """Loads a saved policy: ``best``, ``latest`` or a version.
 
+        The best one has the highest success rate, and of equal ones the highest return.
+
         :raises dmprl.PolicyFileError: if it does not exist, or cannot be read.
         """
         rows = self._lines("evaluations.jsonl")
         if not rows and isinstance(which, str):
             raise PolicyFileError(f"{self.path}: no evaluation yet, so no {which} policy")
         if which == "best":
-            # Of equal ones the latest, as in Rust.
-            version = max(reversed(rows), key=lambda row: row["return_mean"])["policy_version"]
-        elif which == "latest":
+            return Policy.load(self.path)
+        if which == "latest":
             version = rows[-1]["policy_version"]
         elif isinstance(which, int):
             version = which

@@ -69,6 +69,8 @@ class CardTest(unittest.TestCase):
         self.assertIn("It is the best of the run's 3 evaluations", best)
         better = {**worse, "return_mean": -1.0}
         self.assertNotIn("It is the best", card.model_card(facts(rows=[better, row])))
+        rarer = {**better, "success_rate": 0.0}
+        self.assertIn("It is the best", card.model_card(facts(rows=[rarer, row])))
 
     def test_a_task_without_success_has_no_rate_and_no_film_is_no_video(self):
         row = {**facts().row, "success_rate": None}

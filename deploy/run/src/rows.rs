@@ -46,13 +46,18 @@ impl RunDirectory {
         Ok(rows)
     }
 
-    /// Returns the row with the highest mean return; the latest of equals.
+    /// Returns the best row whose policy is saved ([`EvaluationRow::compare`]), the latest of
+    /// equals. If no policy is saved, returns the best row of all.
     ///
     /// # Errors
     /// As [`RunDirectory::evaluations`].
     pub fn best_row(&self) -> anyhow::Result<Option<EvaluationRow>> {
-        let rows = self.evaluations()?;
-        Ok(rows.into_iter().max_by(|a, b| a.return_mean.total_cmp(&b.return_mean)))
+        let saved = self.saved_policies()?;
+        let is_saved = |row: &EvaluationRow| saved.contains(&row.policy_version);
+        let better = |a: &EvaluationRow, b: &EvaluationRow| {
+            is_saved(a).cmp(&is_saved(b)).then_with(|| a.compare(b))
+        };
+        Ok(self.evaluations()?.into_iter().max_by(better))
     }
 
     /// Returns the last row.

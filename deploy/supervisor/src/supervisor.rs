@@ -95,7 +95,8 @@ struct Supervisor<'a> {
     /// Workers that wait for an answer, by number of their request.
     joining: BTreeMap<u64, PendingJoin>,
     join_requests: u64,
-    best_return: f64,
+    /// The best row so far.
+    best: Option<EvaluationRow>,
     started: Instant,
     /// Last redraw of the live display.
     drawn: Instant,
@@ -132,7 +133,7 @@ pub async fn supervise(plan: SupervisorPlan, observer: &mut dyn RunObserver) -> 
     let machine = Machine::new(settings, woke);
     let mut supervisor = Supervisor::new(machine, launcher, observer, events);
     supervisor.lock = lock;
-    supervisor.best_return = known.best_return.unwrap_or(f64::NEG_INFINITY);
+    supervisor.best = known.best;
     supervisor.step(unreadable.map_or(Event::Begin, Event::ActionFailed));
     while !supervisor.machine.is_over() {
         // A blocked terminal (Ctrl-S) can delay a turn.
@@ -169,13 +170,12 @@ pub async fn supervise(plan: SupervisorPlan, observer: &mut dyn RunObserver) -> 
 #[derive(Default)]
 struct Known {
     spec: Option<EnvSpec>,
-    best_return: Option<f64>,
+    best: Option<EvaluationRow>,
 }
 
 impl Known {
     fn read(run: &RunDirectory) -> anyhow::Result<Self> {
-        let best_return = run.best_row()?.map(|row| row.return_mean);
-        Ok(Self { spec: run.spec()?, best_return })
+        Ok(Self { spec: run.spec()?, best: run.best_row()? })
     }
 }
 
@@ -196,7 +196,7 @@ impl<'a> Supervisor<'a> {
             children: BTreeMap::new(),
             joining: BTreeMap::new(),
             join_requests: 0,
-            best_return: f64::NEG_INFINITY,
+            best: None,
             started: now,
             drawn: now,
             processes_due: Some(now),
@@ -331,8 +331,7 @@ impl<'a> Supervisor<'a> {
 
     fn rewind(&mut self) -> anyhow::Result<()> {
         let evaluations = self.launcher.run.evaluations()?;
-        let returns = evaluations.iter().map(|row| row.return_mean);
-        self.best_return = returns.fold(f64::NEG_INFINITY, f64::max);
+        self.best = self.launcher.run.best_row()?;
         self.observer.on_event(RunEvent::Rewound { evaluations });
         Ok(())
     }
@@ -345,8 +344,10 @@ impl<'a> Supervisor<'a> {
     fn notify(&mut self, mut event: RunEvent) {
         match &mut event {
             RunEvent::Evaluated { row, is_best } => {
-                *is_best = row.return_mean > self.best_return;
-                self.best_return = self.best_return.max(row.return_mean);
+                *is_best = self.best.as_ref().is_none_or(|best| row.compare(best).is_gt());
+                if *is_best {
+                    self.best = Some(row.clone());
+                }
             }
             RunEvent::Progress { processes, .. } if self.observer.shows_processes() => {
                 self.drawn = Instant::now();

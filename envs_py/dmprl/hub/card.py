@@ -155,13 +155,17 @@ def result(facts: Facts) -> str:
     lines.append(("Episodes", f"{count}, without noise, seeds {first} to {first + count - 1}"))
     rows = "".join(f"| {name} | {value} |\n" for name, value in lines)
     text = "Return is mean and standard deviation over these episodes, of one policy from one seed."
-    best = max(other["return_mean"] for other in facts.rows)
-    if len(facts.rows) > 1 and row["return_mean"] == best:
+    if len(facts.rows) > 1 and rank(row) == max(map(rank, facts.rows)):
         text += (
             f" It is the best of the run's {len(facts.rows)} evaluations, so other episodes may "
             "have a lower return."
         )
     return f"| | |\n|---|---|\n{rows}\n{text}"
+
+
+def rank(row: dict[str, Any]) -> tuple[float, float]:
+    """Orders evaluations as ``--policy best`` does: by success rate, then by mean return."""
+    return row["success_rate"] or 0.0, row["return_mean"]
 
 
 def kind(policy: dict[str, Any]) -> str:

@@ -1,5 +1,6 @@
 //! Messages between a supervisor and the processes that it starts.
 
+use std::cmp::Ordering;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -258,6 +259,16 @@ pub struct EvaluationNotFinite {
 }
 
 impl EvaluationRow {
+    /// Compares the policies by their success rates, and equal ones by their mean returns. With a
+    /// sparse reward the return mostly says how soon the goal was reached.
+    #[must_use]
+    pub fn compare(&self, other: &Self) -> Ordering {
+        let success_rate = |row: &Self| row.success_rate.unwrap_or(0.0);
+        success_rate(self)
+            .total_cmp(&success_rate(other))
+            .then(self.return_mean.total_cmp(&other.return_mean))
+    }
+
     /// Checks that JSON can represent the row.
     ///
     /// # Errors

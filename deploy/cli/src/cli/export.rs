@@ -46,7 +46,7 @@ pub(super) struct ExportArgs {
     /// Output file; an existing one is replaced [default: the task's name, in the run directory].
     #[arg(long, value_name = "PATH")]
     output: Option<PathBuf>,
-    /// best, latest, or a policy version.
+    /// best (by success rate, then by return), latest, or a policy version.
     #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
     policy: PolicyChoice,
     /// Command that holds the robot: zero-velocity, zero-torque, or position=V,V,… with one value

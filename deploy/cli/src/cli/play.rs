@@ -34,7 +34,7 @@ EXAMPLES
 pub(super) struct PlayArgs {
     /// The run directory, or zoo:TASK for a policy that comes with dmprl.
     run: PathBuf,
-    /// best, latest, or a policy version.
+    /// best (by success rate, then by return), latest, or a policy version.
     #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
     policy: PolicyChoice,
     /// Seed of the first episode [default: evaluation.first_seed of the run].

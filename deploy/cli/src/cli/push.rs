@@ -44,7 +44,7 @@ pub(super) struct PushArgs {
     /// The repository.
     #[arg(value_name = "OWNER/NAME")]
     repository: Repository,
-    /// best, latest, or a policy version.
+    /// best (by success rate, then by return), latest, or a policy version.
     #[arg(long, default_value_t = PolicyChoice::Best, value_name = "best|latest|VERSION")]
     policy: PolicyChoice,
     /// Command that holds the robot, as in `dmprl export`.

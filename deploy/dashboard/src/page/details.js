@@ -109,13 +109,16 @@ export class Details {
     }
     note.textContent = `Episode i is reset with seed ${first_seed} + i. `
       + (all > rows.length ? `Showing the newest ${rows.length} of ${count(all)}.` : "");
-    const best = Math.max(...rows.map((row) => row.return_mean));
+    // As `--policy best`: the highest success rate, and of equal ones the highest return.
+    const rank = (row, other) => (row.success_rate ?? 0) - (other.success_rate ?? 0)
+      || row.return_mean - other.return_mean;
+    const best = rows.reduce((one, other) => (rank(other, one) >= 0 ? other : one));
     const heads = [["Steps", true], ["Time", true], ["Policy", true], ["Return", true],
       ["Lowest", true], ["Highest", true], ["Success", true], ["Smoothness", true],
       ["Return of each episode", false]];
     fill(table, heads, rows.map((row) => [
       count(row.env_steps), duration(row.wall_s), count(row.policy_version),
-      element("td", { className: row.return_mean === best ? "number differs" : "number" },
+      element("td", { className: rank(row, best) === 0 ? "number differs" : "number" },
         figure(row.return_mean)),
       figure(Math.min(...row.returns)), figure(Math.max(...row.returns)),
       share(row.success_rate), figure(row.smoothness),

@@ -125,6 +125,22 @@ fn best_has_the_highest_mean_return_and_latest_is_the_last_row() {
 }
 
 #[test]
+fn the_best_policy_has_the_highest_success_rate_of_those_that_are_saved() {
+    let parent = tempfile::tempdir().unwrap();
+    let run = new_run(&parent);
+    let rates = [(1, -48.0, 0.1), (2, -49.0, 0.6), (3, -49.5, 0.6), (4, -49.9, 0.7)];
+    for (version, return_mean, success_rate) in rates {
+        fs::write(run.policy_path(version), "").unwrap();
+        let row = EvaluationRow { success_rate: Some(success_rate), ..row(version, return_mean) };
+        run.append_evaluation(&row).unwrap();
+    }
+    assert_eq!(run.choose_policy(PolicyChoice::Best).unwrap().version, 4);
+    // An earlier version of the program kept other policies.
+    fs::remove_file(run.policy_path(4)).unwrap();
+    assert_eq!(run.choose_policy(PolicyChoice::Best).unwrap().version, 2);
+}
+
+#[test]
 fn pruning_keeps_best_latest_checkpointed_and_unevaluated_policies() {
     let parent = tempfile::tempdir().unwrap();
     let run = new_run(&parent);
