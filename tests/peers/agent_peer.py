@@ -30,9 +30,13 @@ AGENTS = {
     "sbx-td3": ("sbx", "TD3"),
     "sbx-sac": ("sbx", "SAC"),
     "sbx-crossq": ("sbx", "CrossQ"),
+    "sbx-simba": ("sbx", "SAC"),
+    "sb3-tqc": ("sb3_contrib", "TQC"),
     "sb3-tqc-her": ("sb3_contrib", "TQC"),
 }
 WITH_HINDSIGHT = "sb3-tqc-her"
+POLICIES = {WITH_HINDSIGHT: "MultiInputPolicy", "sbx-simba": "SimbaPolicy"}
+"""Policies other than ``MlpPolicy``."""
 
 ZOO_SETTINGS = {
     "batch_size": 2048,
@@ -55,19 +59,20 @@ class Evaluator:
         self.env = env
         self.episodes = settings["episodes"]
         self.first_seed = settings["first_seed"]
-        self.by_success = settings["by_success"]
         self.seconds = 0.0
 
-    def value(self, agent):
-        """Returns the mean return or the success rate, or None if no success is reported."""
+    def evaluate(self, agent):
+        """Returns mean return and success rate, or None if a return is not finite."""
         start = time.monotonic()
-        values = [self.episode(agent, self.first_seed + index) for index in range(self.episodes)]
+        episodes = [self.episode(agent, self.first_seed + index) for index in range(self.episodes)]
         self.seconds += time.monotonic() - start
-        mean = float("nan") if None in values else float(sum(values) / len(values))
-        return mean if math.isfinite(mean) else None
+        returns, successes = zip(*episodes, strict=True)
+        rate = None if None in successes else sum(successes) / len(successes)
+        mean = sum(returns) / len(returns)
+        return {"return_mean": mean, "success_rate": rate} if math.isfinite(mean) else None
 
     def episode(self, agent, seed):
-        """Runs one episode."""
+        """Runs one episode, and returns its return and success (None if none is reported)."""
         observation, _ = self.env.reset(seed=seed)
         total, success = 0.0, None
         for _ in range(EPISODE_STEPS_MAX):
@@ -77,9 +82,7 @@ class Evaluator:
             success = info.get("is_success", info.get("success", success))
             if terminated or truncated:
                 break
-        if not self.by_success:
-            return total
-        return None if success is None else float(success)
+        return total, None if success is None else float(success)
 
 
 def make(kind, settings):
@@ -108,7 +111,7 @@ def make(kind, settings):
         arguments |= ZOO_SETTINGS | hindsight()
     if settings["algorithm"] is not None:
         arguments |= ours(name, settings["algorithm"])
-    policy = "MultiInputPolicy" if kind == WITH_HINDSIGHT else "MlpPolicy"
+    policy = POLICIES.get(kind, "MlpPolicy")
     agent = getattr(agents, name)(policy, env, **arguments)
     return agent, evaluated, f"{module} {agents.__version__}"
 
@@ -156,21 +159,31 @@ def flattened(env):
     return env if is_vector else gymnasium.wrappers.FlattenObservation(env)
 
 
+def reached(evaluated, target):
+    """Returns whether an evaluation reaches a target.
+
+    - ``target``: such as ``{"of": "return_mean", "value": -5.2}``
+    """
+    value = None if evaluated is None else evaluated[target["of"]]
+    return value is not None and value >= target["value"]
+
+
 def train(agent, evaluator, settings, send):
-    """Trains until the target or a limit."""
+    """Trains until the target or a limit. Without a target, evaluates only the last policy."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     interval, seconds_max = settings["evaluation_interval"], settings["seconds_max"]
+    target = settings["target"]
     start_s = time.monotonic() - STARTED
 
     class Evaluations(BaseCallback):
-        value = None
+        evaluated = None
 
         def _on_step(self):
-            if self.num_timesteps % interval == 0:
-                self.value = evaluator.value(agent)
+            if target is not None and self.num_timesteps % interval == 0:
+                self.evaluated = evaluator.evaluate(agent)
                 self.send(ended=False)
-                if self.value is not None and self.value >= settings["target"]:
+                if reached(self.evaluated, target):
                     return False
             return time.monotonic() - STARTED < seconds_max
 
@@ -179,7 +192,7 @@ def train(agent, evaluator, settings, send):
                 {
                     "ended": ended,
                     "env_steps": self.num_timesteps,
-                    "value": self.value,
+                    "evaluated": self.evaluated,
                     "start_s": start_s,
                     "evaluation_s": evaluator.seconds,
                 }
@@ -187,6 +200,8 @@ def train(agent, evaluator, settings, send):
 
     evaluations = Evaluations()
     agent.learn(settings["steps"], callback=evaluations)
+    if target is None:
+        evaluations.evaluated = evaluator.evaluate(agent)
     evaluations.send(ended=True)
 
 

@@ -1,11 +1,12 @@
 //! The report of `dmprl bench peers`: one JSON object for programs, a table for people.
 
+use dmprl_analysis::report::Summary;
 use dmprl_run::format::grouped;
 use dmprl_run::{Machine, Progress};
 use dmprl_shared::config::ExperimentConfig;
 use serde_json::{Map, Value, json};
 
-use super::{AgentKind, AgentsBench, Target, Training};
+use super::{AgentKind, AgentsBench, Evaluated, Target, Training};
 use crate::statistics::{load_average, max, median, min};
 
 /// Name of our own trainings.
@@ -44,6 +45,20 @@ impl Candidate {
         self.trainings.iter().map(value).collect()
     }
 
+    /// Summary of one result of the last evaluations; `None` if a training has none.
+    fn summary(&self, result: impl Fn(&Evaluated) -> Option<f64>) -> Option<Summary> {
+        let results = self.trainings.iter().map(|it| it.evaluated.as_ref().and_then(&result));
+        Summary::of(&results.collect::<Option<Vec<_>>>()?)
+    }
+
+    fn returns(&self) -> Option<Summary> {
+        self.summary(|it| Some(it.return_mean))
+    }
+
+    fn success_rates(&self) -> Option<Summary> {
+        self.summary(|it| it.success_rate)
+    }
+
     /// Median time; `None` if half of the trainings or more did not reach the target, because their
     /// times are unknown.
     fn median_s(&self) -> Option<f64> {
@@ -74,13 +89,13 @@ impl Figures {
         progress: &dyn Progress,
     ) {
         let name = kind.map_or(OURS, AgentKind::name);
-        let (what, steps) = (Target::of(&self.config).name(), grouped(training.env_steps));
-        let value = training.value.map_or_else(|| "none".to_owned(), |value| format!("{value:.2}"));
-        let missed = if training.reached { "" } else { ", target not reached" };
-        progress.print(&format!(
-            "{name}: {what} {value} after {:.1} s and {steps} steps{missed}",
-            training.seconds
-        ));
+        let value = training.evaluated.map_or_else(|| "no evaluation".to_owned(), described);
+        let (seconds, steps) = (training.seconds, grouped(training.env_steps));
+        let missed = match training.reached || self.target() == Target::None {
+            true => "",
+            false => ", target not reached",
+        };
+        progress.print(&format!("{name}: {value} after {seconds:.1} s and {steps} steps{missed}"));
         if let Some(candidate) = self.candidates.iter_mut().find(|it| it.kind == kind) {
             candidate.trainings.push(training);
         }
@@ -97,6 +112,10 @@ impl Figures {
         self.candidates.iter().any(|candidate| !candidate.trainings.is_empty())
     }
 
+    fn target(&self) -> Target {
+        Target::of(&self.config)
+    }
+
     fn ours_s(&self) -> Option<f64> {
         self.candidates.first().and_then(Candidate::median_s)
     }
@@ -104,7 +123,11 @@ impl Figures {
     /// Returns the figures as one JSON object. Unavailable ones are null.
     #[must_use]
     pub fn json(&self) -> Value {
-        let target = Target::of(&self.config);
+        let target = match self.target() {
+            Target::Return(value) => json!({ "name": "return", "value": value }),
+            Target::Success(value) => json!({ "name": "success", "value": value }),
+            Target::None => Value::Null,
+        };
         let candidates: Map<_, _> = self
             .candidates
             .iter()
@@ -116,14 +139,15 @@ impl Figures {
                         json!({
                             "reached": it.reached, "seconds": it.seconds, "start_s": it.start_s,
                             "evaluation_s": it.evaluation_s, "env_steps": it.env_steps,
-                            "value": it.value,
+                            "evaluated": it.evaluated,
                         })
                     })
                     .collect();
                 let ratio = candidate.median_s().zip(self.ours_s()).map(|(it, ours)| it / ours);
                 let object = json!({
                     "median_s": candidate.median_s(), "ratio": ratio,
-                    "reached": candidate.reached(), "trainings": trainings,
+                    "reached": candidate.reached(), "return": candidate.returns(),
+                    "success": candidate.success_rates(), "trainings": trainings,
                     "note": candidate.note,
                 });
                 (candidate.name().to_owned(), object)
@@ -133,7 +157,7 @@ impl Figures {
             "task": self.config.task.name,
             "algorithm": self.config.algorithm.name,
             "policy": self.config.policy.kind,
-            "target": { "name": target.name(), "value": target.value },
+            "target": target,
             "episodes": self.config.evaluation.episodes,
             "evaluation_interval_steps": self.config.evaluation.interval_steps,
             "max_minutes": self.config.run.max_minutes,
@@ -150,45 +174,45 @@ impl Figures {
     /// Returns the figures as a table.
     #[must_use]
     pub fn text(&self) -> String {
-        let target = Target::of(&self.config);
-        let mut lines = vec![
-            format!(
-                "{} · {} of {} episodes at least {} · peers with {} · {}, {} cores",
-                self.config.task.name,
-                target.name(),
-                self.config.evaluation.episodes,
-                target.value,
-                if self.equal_settings { "our settings" } else { "their defaults" },
-                self.machine.cpu.as_deref().unwrap_or("unknown processor"),
-                self.machine.cores
-            ),
-            if self.interrupted { "interrupted: only the trainings that had ended" } else { "" }
-                .to_owned(),
-            format!(
-                "  {:<12}{:>8}  {:>8}  {:<17}{:>9}{:>8}{:>8}{:>8}",
-                "", "reached", "time s", "(range)", "steps", "start", "eval", "ratio"
-            ),
-        ];
+        let mut lines = vec![self.title()];
+        if self.interrupted {
+            lines.push("interrupted: only the trainings that had ended".to_owned());
+        }
+        let (header, legend) = match self.target() {
+            Target::None => (FINAL_HEADER, FINAL_LEGEND),
+            Target::Return(_) | Target::Success(_) => (TIME_HEADER, TIME_LEGEND),
+        };
+        lines.extend([String::new(), header.to_owned()]);
         for candidate in &self.candidates {
-            lines.push(match &candidate.note {
-                _ if !candidate.trainings.is_empty() => self.row(candidate),
-                Some(why) => format!("  {:<12}absent: {why}", candidate.name()),
-                None => format!("  {:<12}not trained", candidate.name()),
+            lines.push(match (&candidate.note, self.target()) {
+                (_, Target::None) if !candidate.trainings.is_empty() => final_row(candidate),
+                _ if !candidate.trainings.is_empty() => self.time_row(candidate),
+                (Some(why), _) => format!("  {:<12}absent: {why}", candidate.name()),
+                (None, _) => format!("  {:<12}not trained", candidate.name()),
             });
         }
-        lines.extend([
-            String::new(),
-            "time: medians over the seeds, from the start of the process to the target; steps, \
-             start (until the"
-                .to_owned(),
-            "first step) and eval (only evaluation, within time): medians; ratio: time relative to \
-             ours"
-            .to_owned(),
-        ]);
+        lines.extend([String::new(), legend.to_owned()]);
         lines.join("\n")
     }
 
-    fn row(&self, candidate: &Candidate) -> String {
+    fn title(&self) -> String {
+        let run = &self.config.run;
+        let target = match self.target() {
+            Target::Return(value) => format!("return of at least {value}"),
+            Target::Success(value) => format!("success rate of at least {value}"),
+            Target::None => format!("after {} minutes", run.max_minutes),
+        };
+        format!(
+            "{} · {target} · {} episodes · peers with {} · {}, {} cores",
+            self.config.task.name,
+            self.config.evaluation.episodes,
+            if self.equal_settings { "our settings" } else { "their defaults" },
+            self.machine.cpu.as_deref().unwrap_or("unknown processor"),
+            self.machine.cores
+        )
+    }
+
+    fn time_row(&self, candidate: &Candidate) -> String {
         let count = candidate.trainings.len();
         let (time, ratio) = match (candidate.median_s(), self.ours_s()) {
             (Some(time), Some(ours)) => (format!("{time:.1}"), format!("{:.1}", time / ours)),
@@ -209,6 +233,41 @@ impl Figures {
     }
 }
 
+const TIME_HEADER: &str =
+    "               reached    time s  (range)              steps   start    eval   ratio";
+const TIME_LEGEND: &str =
+    "time: medians over the seeds, from the start of the process to the target; steps, start (until
+the first step) and eval (only evaluation, within time): medians; ratio: time relative to ours";
+const FINAL_HEADER: &str =
+    "               seeds    return  (interval)             success  (interval)           steps";
+const FINAL_LEGEND: &str =
+    "return, success: interquartile means over the seeds with 95 % bootstrap intervals (fewer than
+four seeds: means with ranges); steps: medians";
+
+fn final_row(candidate: &Candidate) -> String {
+    let (success, within) = point_and_bounds(candidate.success_rates());
+    let (mean, interval) = point_and_bounds(candidate.returns());
+    let steps = median(&candidate.values(|it| it.env_steps as f64)).unwrap_or(0.0);
+    format!(
+        "  {:<12}{:>6}{mean:>10}  {interval:<24}{success:>6}  {within:<16}{:>9}",
+        candidate.name(),
+        candidate.trainings.len(),
+        grouped(steps as u64),
+    )
+}
+
+fn point_and_bounds(summary: Option<Summary>) -> (String, String) {
+    summary.map_or_else(Default::default, |summary| {
+        let (point, [low, high]) = summary.point_and_bounds();
+        (format!("{point:.2}"), format!("({low:.2} to {high:.2})"))
+    })
+}
+
+fn described(evaluated: Evaluated) -> String {
+    let success = evaluated.success_rate.map(|rate| format!(", success {rate:.2}"));
+    format!("return {:.2}{}", evaluated.return_mean, success.unwrap_or_default())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -220,7 +279,7 @@ mod tests {
             start_s: Some(1.0),
             evaluation_s: 2.0,
             env_steps: 5000,
-            value: Some(-5.0),
+            evaluated: None,
         }
     }
 

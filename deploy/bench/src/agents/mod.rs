@@ -1,10 +1,12 @@
-//! `dmprl bench peers`: the time until a policy reaches a target, beside other libraries.
+//! `dmprl bench peers`: the time until a policy reaches a target, or how good it is after a given
+//! time, beside other libraries.
 //!
 //! Every round trains each candidate once with the round's seed, in turns, so that a drift of the
 //! machine's speed affects all alike. `ours` is a whole `dmprl train`, measured from the start of
 //! its process to its end. A peer is a process of `tests/peers/agent_peer.py` (`peer`), measured
 //! from its start to the end of the evaluation that reaches the target. Evaluations, environments
-//! and the number of steps before the first update are the same for all.
+//! and the number of steps before the first update are the same for all. Without a target, the only
+//! evaluation is that of the last policy, and the time limit does not include it.
 
 mod figures;
 mod ours;
@@ -16,6 +18,7 @@ use std::time::Duration;
 use anyhow::Context;
 use dmprl_run::{Interrupted, Manifest, Progress, Watch};
 use dmprl_shared::config::ExperimentConfig;
+use serde::{Deserialize, Serialize};
 
 use super::announce_round;
 
@@ -27,7 +30,7 @@ pub struct AgentsBench {
     /// Path of this program.
     pub program: PathBuf,
     /// The resolved configuration of ours. `run.until_return` or `run.until_success` is the target,
-    /// `run.steps` and `run.max_minutes` are the limits of each training.
+    /// if either is finite; `run.steps` and `run.max_minutes` are the limits of each training.
     pub config: ExperimentConfig,
     /// The peers.
     pub peers: Vec<AgentKind>,
@@ -43,26 +46,43 @@ pub struct AgentsBench {
     pub package_path: PathBuf,
 }
 
-/// The value to reach.
+/// What ends a training, besides its limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Target {
-    is_success: bool,
-    value: f64,
+enum Target {
+    /// An evaluation with this mean return.
+    Return(f64),
+    /// An evaluation with this success rate.
+    Success(f64),
+    /// Nothing: all trainings last as long, and their last policies are compared.
+    None,
 }
 
 impl Target {
     fn of(config: &ExperimentConfig) -> Self {
         let (by_return, by_success) = (config.run.until_return, config.run.until_success);
-        match by_return.is_finite() {
-            true => Self { is_success: false, value: by_return },
-            false => Self { is_success: true, value: by_success },
+        match (by_return.is_finite(), by_success.is_finite()) {
+            (true, _) => Self::Return(by_return),
+            (_, true) => Self::Success(by_success),
+            _ => Self::None,
         }
     }
 
-    /// Name of the value in a report.
-    fn name(self) -> &'static str {
-        if self.is_success { "success" } else { "return" }
+    /// Whether an evaluation reaches the target.
+    fn is_reached(self, evaluated: &Evaluated) -> bool {
+        match self {
+            Self::Return(target) => evaluated.return_mean >= target,
+            Self::Success(target) => evaluated.success_rate.is_some_and(|rate| rate >= target),
+            Self::None => false,
+        }
     }
+}
+
+/// Result of an evaluation.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+struct Evaluated {
+    return_mean: f64,
+    /// `None` if the environment reports no success.
+    success_rate: Option<f64>,
 }
 
 /// One training, until the target or a limit.
@@ -76,8 +96,8 @@ struct Training {
     /// The part that only evaluates; 0 if evaluations run beside the training.
     evaluation_s: f64,
     env_steps: u64,
-    /// Value of the last evaluation; `None` without one.
-    value: Option<f64>,
+    /// The last evaluation; `None` without one.
+    evaluated: Option<Evaluated>,
 }
 
 /// Runs the benchmark. If the user interrupts it, returns the trainings that have ended, or `None`

@@ -10,16 +10,17 @@ use dmprl_shared::config::ExperimentConfig;
 use dmprl_supervisor::WholeRun;
 use serde::Deserialize;
 
-use super::{Target, Training, limit};
+use super::{Evaluated, Target, Training, limit};
 
 /// Interval between checks for the exit. It counts as time of the training.
 const CHECK_INTERVAL: Duration = Duration::from_millis(5);
 
+/// A row of `evaluations.jsonl`.
 #[derive(Debug, Deserialize)]
-struct Evaluated {
+struct Row {
     env_steps: u64,
-    return_mean: f64,
-    success_rate: Option<f64>,
+    #[serde(flatten)]
+    evaluated: Evaluated,
 }
 
 /// Notices the first environment step in the run's events.
@@ -98,14 +99,9 @@ fn training(
     run: &Path,
 ) -> anyhow::Result<Training> {
     let rows = std::fs::read_to_string(run.join("evaluations.jsonl")).unwrap_or_default();
-    let rows = rows.lines().map(serde_json::from_str).collect::<Result<Vec<Evaluated>, _>>();
+    let rows = rows.lines().map(serde_json::from_str).collect::<Result<Vec<Row>, _>>();
     let rows = rows.context("evaluations.jsonl")?;
-    let value = |row: &Evaluated| match target.is_success {
-        true => row.success_rate,
-        false => Some(row.return_mean),
-    };
-    let reached = |row: &&Evaluated| value(row).is_some_and(|value| value >= target.value);
-    let first = rows.iter().find(reached);
+    let first = rows.iter().find(|row| target.is_reached(&row.evaluated));
     let row = first.or(rows.last());
     Ok(Training {
         reached: first.is_some(),
@@ -113,7 +109,7 @@ fn training(
         start_s: start.map(|start| start.as_secs_f64()),
         evaluation_s: 0.0,
         env_steps: row.map_or(0, |row| row.env_steps),
-        value: row.and_then(value),
+        evaluated: row.map(|row| row.evaluated),
     })
 }
 
@@ -129,12 +125,12 @@ mod tests {
                     {\"env_steps\":9500,\"return_mean\":-6.0,\"success_rate\":null}\n";
         std::fs::write(folder.path().join("evaluations.jsonl"), rows).unwrap();
         let read = |target| training(target, 7.0, None, folder.path()).unwrap();
-        let by_return = |value| read(Target { is_success: false, value });
-        let (easy, hard) = (by_return(-5.2), by_return(-4.0));
-        assert_eq!((easy.reached, easy.env_steps, easy.value), (true, 9000, Some(-5.0)));
-        assert_eq!((hard.reached, hard.env_steps, hard.value), (false, 9500, Some(-6.0)));
+        let evaluated = |return_mean| Some(Evaluated { return_mean, success_rate: None });
+        let result = |it: Training| (it.reached, it.env_steps, it.evaluated);
+        assert_eq!(result(read(Target::Return(-5.2))), (true, 9000, evaluated(-5.0)));
+        assert_eq!(result(read(Target::Return(-4.0))), (false, 9500, evaluated(-6.0)));
+        assert_eq!(result(read(Target::None)), (false, 9500, evaluated(-6.0)));
         // The environment reports no success.
-        let by_success = read(Target { is_success: true, value: 0.1 });
-        assert_eq!((by_success.reached, by_success.value), (false, None));
+        assert!(!read(Target::Success(0.1)).reached);
     }
 }

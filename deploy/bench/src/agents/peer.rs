@@ -11,7 +11,7 @@ use dmprl_shared::config::{ExperimentConfig, PolicyKind};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use super::{AgentsBench, Target, Training, limit};
+use super::{AgentsBench, Evaluated, Target, Training, limit};
 use crate::child::LineChild;
 
 /// An algorithm of another library.
@@ -27,6 +27,10 @@ pub enum AgentKind {
     SbxSac,
     /// CrossQ of SBX (JAX).
     SbxCrossq,
+    /// SAC of SBX (JAX) with SimBa's networks.
+    SbxSimba,
+    /// TQC of SB3-Contrib (PyTorch).
+    Sb3Tqc,
     /// TQC with hindsight of SB3-Contrib (PyTorch), for tasks with goals; the RL Zoo's settings for
     /// those that move an object.
     Sb3TqcHer,
@@ -41,6 +45,8 @@ impl AgentKind {
             Self::SbxTd3 => "sbx-td3",
             Self::SbxSac => "sbx-sac",
             Self::SbxCrossq => "sbx-crossq",
+            Self::SbxSimba => "sbx-simba",
+            Self::Sb3Tqc => "sb3-tqc",
             Self::Sb3TqcHer => "sb3-tqc-her",
         }
     }
@@ -51,7 +57,7 @@ impl AgentKind {
 struct State {
     ended: bool,
     env_steps: u64,
-    value: Option<f64>,
+    evaluated: Option<Evaluated>,
     start_s: f64,
     evaluation_s: f64,
 }
@@ -96,12 +102,12 @@ pub(super) fn train(
         if state.ended {
             let target = Target::of(config);
             let training = Training {
-                reached: state.value.is_some_and(|value| value >= target.value),
+                reached: state.evaluated.is_some_and(|it| target.is_reached(&it)),
                 seconds,
                 start_s: Some(state.start_s),
                 evaluation_s: state.evaluation_s,
                 env_steps: state.env_steps,
-                value: state.value,
+                evaluated: state.evaluated,
             };
             return Ok(Ok((about, training)));
         }
@@ -109,7 +115,11 @@ pub(super) fn train(
 }
 
 fn settings_of(config: &ExperimentConfig, equal: bool) -> Value {
-    let target = Target::of(config);
+    let target = match Target::of(config) {
+        Target::Return(value) => json!({ "of": "return_mean", "value": value }),
+        Target::Success(value) => json!({ "of": "success_rate", "value": value }),
+        Target::None => Value::Null,
+    };
     json!({
         "task": config.task.id,
         "options": config.task.options_toml(),
@@ -121,8 +131,7 @@ fn settings_of(config: &ExperimentConfig, equal: bool) -> Value {
         "evaluation_interval": config.evaluation.interval_steps,
         "episodes": config.evaluation.episodes,
         "first_seed": config.evaluation.first_seed,
-        "by_success": target.is_success,
-        "target": target.value,
+        "target": target,
         "algorithm": equal.then(|| algorithm_of(config)),
     })
 }

@@ -16,6 +16,7 @@ use crate::terminal::TerminalProgress;
 
 const HELP: &str = "\
 Trains one seed after another with each candidate, in turns, until an evaluation reaches the target.
+Without a target, each trains for --max-minutes, and then its last policy is evaluated once.
 The time runs from the start of the process, imports included. Ours is a whole `dmprl train`, up to
 its end. A peer has one environment, the CPU, and its library's default settings (TD3: with Gaussian
 noise of 0.1; sb3-tqc-her: the RL Zoo's), or ours with --equal-settings. All have the same number of
@@ -29,13 +30,14 @@ EXAMPLES
   dmprl bench peers --task HalfCheetah-v5 --policy mlp --until-return 3000 --steps 200000 \\
       --max-minutes 60 --peer sb3-td3 --peer sbx-crossq --json
   dmprl bench peers --task pusher --until-return -34 --preset fast --equal-settings
-  dmprl bench peers --task panda-push --until-success 0.95 --peer sb3-tqc-her --seeds 1";
+  dmprl bench peers --task panda-push --until-success 0.95 --peer sb3-tqc-her --seeds 1
+  dmprl bench peers --task HalfCheetah-v5 --policy mlp --max-minutes 5 --peer sb3-tqc \\
+      --peer sbx-crossq --peer sbx-simba --set evaluation.episodes=100";
 
 /// Arguments of `dmprl bench peers`.
 #[derive(Debug, Args)]
 #[command(after_help = HELP)]
-#[group(id = "target", required = true, multiple = false,
-        args = ["until_return", "until_success"])]
+#[group(id = "target", multiple = false, args = ["until_return", "until_success"])]
 pub(super) struct PeersArgs {
     /// A task of `dmprl tasks`, or a Gymnasium id.
     #[arg(long)]
@@ -48,7 +50,7 @@ pub(super) struct PeersArgs {
     /// Success rate to reach, 0 to 1.
     #[arg(long, value_name = "S")]
     until_success: Option<f64>,
-    /// Maximum environment steps of a training.
+    /// Maximum environment steps of a training [default: the task's with a target, else no limit].
     #[arg(long, value_name = "N")]
     steps: Option<u32>,
     /// Maximum time of a training [min].
@@ -77,15 +79,20 @@ pub(super) fn run(args: &PeersArgs) -> anyhow::Result<Outcome> {
     let number = |value: f64| Some(Value::Float(value));
     // The other goal of a configuration file is not one of this benchmark.
     let goal = |value: Option<f64>| number(value.unwrap_or(f64::INFINITY));
+    let has_target = args.until_return.is_some() || args.until_success.is_some();
+    let steps = args.steps.or((!has_target).then_some(u32::MAX));
     let flags = [
         flag("--until-return", "run.until_return", goal(args.until_return)),
         flag("--until-success", "run.until_success", goal(args.until_success)),
         flag("--max-minutes", "run.max_minutes", number(args.max_minutes)),
-        flag("--steps", "run.steps", args.steps.map(|steps| Value::Integer(steps.into()))),
+        flag("--steps", "run.steps", steps.map(|steps| Value::Integer(steps.into()))),
     ];
     let config = merge(&args.configured.sources(&args.task, flags)?)?;
     let mut config = config.resolve(Limits { cores: cores() }).map_err(refuse)?;
     make_absolute(&mut config)?;
+    if !has_target {
+        config.evaluation.interval_steps = u32::MAX.into(); // only that of the last policy
+    }
     if !config.run.max_minutes.is_finite() {
         return Err(wrong_use("--max-minutes inf: a training that never learns would not end"));
     }

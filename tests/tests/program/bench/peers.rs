@@ -10,8 +10,10 @@ use super::{assert_no_temporary_files, start};
 /// Answers as `tests/peers/agent_peer.py` does, with the batch size of its settings as description.
 const PEER: &str = r#"#!/bin/sh
 echo '{"ready": "'$(grep -o 'batch_size":[0-9]*' "$4" | tr -d '"')'"}'
-echo '{"ended": false, "env_steps": 50, "value": -2e9, "start_s": 0.5, "evaluation_s": 0.1}'
-echo '{"ended": true, "env_steps": 100, "value": -3.0, "start_s": 0.5, "evaluation_s": 0.2}'
+times='"start_s": 0.5, "evaluation_s": 0.1'
+echo '{"ended": false, "env_steps": 50, "evaluated": null, '"$times"'}'
+evaluated='{"return_mean": -3.0, "success_rate": null}'
+echo '{"ended": true, "env_steps": 100, "evaluated": '"$evaluated, $times"'}'
 "#;
 
 fn bench(place: &Workplace, peer_python: &str, more: &[&str]) -> Running {
@@ -49,6 +51,28 @@ fn each_seed_is_trained_until_the_target_by_all() {
     assert!(json["candidates"]["sbx-sac"]["ratio"].as_f64() < Some(1.0), "{json}");
     place.assert_no_process();
     assert_no_temporary_files(&place);
+}
+
+#[test]
+fn last_policies_are_compared_if_there_is_no_target() {
+    let place = Workplace::new();
+    let python = stand_in(&place);
+    let time = ["--max-minutes", "0.05", "--seeds", "2", "--peer", "sbx-simba"];
+    let finished = bench(&place, &python, &[&time[..], &["--json"]].concat()).wait();
+    let json = finished.with_status(0).json();
+    assert!(json["target"].is_null(), "{json}");
+    let (ours, peer) = (&json["candidates"]["ours"], &json["candidates"]["sbx-simba"]);
+    assert_eq!(peer["return"]["mean"], -3.0, "{json}");
+    assert_eq!(ours["return"]["count"], 2, "{json}");
+    assert!(ours["success"].is_null(), "Pendulum reports no success: {json}");
+    for training in ours["trainings"].as_array().unwrap() {
+        // Longer than the 0.05 minutes, because start and evaluation are added.
+        assert!(training["seconds"].as_f64() >= Some(3.0), "{json}");
+        assert!(training["env_steps"].as_u64() > Some(0), "{json}");
+    }
+    let table = bench(&place, &python, &time).wait().with_status(0).printed;
+    assert!(table.contains("after 0.05 minutes"), "{table}");
+    assert!(table.contains("-3.00  (-3.00 to -3.00)"), "{table}");
 }
 
 #[test]
