@@ -19,8 +19,8 @@
 //!    (`action_rate_penalty`, `action_acceleration_penalty`). Those on saturation and on the
 //!    distance from actions that led to the goal are optional (`saturation_penalty`,
 //!    `imitation_penalty`).
-//! 7. Learning rates of networks come from the configuration (1e-3 instead of 3e-4); that of the
-//!    temperature is 3e-4. Two updates per segment are 0.4 per environment step instead of 1.
+//! 7. Learning rates come from the configuration: 1e-3 for networks and 3e-3 for the temperature
+//!    instead of 3e-4. Two updates per segment are 0.4 per environment step instead of 1.
 //!    Observations are normalised.
 //! 8. With `outcome_model` the critics also see predicted outcomes of the segment (`outcome.rs`).
 

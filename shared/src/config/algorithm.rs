@@ -152,7 +152,8 @@ impl Default for Td3Config {
 pub struct SacConfig {
     /// Initial weight of the entropy.
     pub initial_temperature: f64,
-    /// Adam step size of the temperature's logarithm.
+    /// Adam step size of the temperature's logarithm. The default for `mlp` policies is 0.0003, as
+    /// published.
     pub temperature_learning_rate: f64,
     /// Target entropy for each action of a decision \[nat\]. The default for `mlp` policies is -1.
     /// Segments need a smaller magnitude because their actions are correlated.
@@ -163,7 +164,7 @@ impl Default for SacConfig {
     fn default() -> Self {
         Self {
             initial_temperature: 1.0,
-            temperature_learning_rate: 3e-4,
+            temperature_learning_rate: 3e-3,
             target_entropy_per_action: -0.5,
         }
     }

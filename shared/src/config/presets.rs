@@ -208,11 +208,13 @@ pub fn suitable_preset(task: &str) -> &'static str {
 pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
     match kind {
         PolicyKind::Dmp | PolicyKind::Chunk => None,
-        // No preset sets the target entropy.
+        // No preset sets the target entropy. A policy that decides at every step has more updates,
+        // so the published step size of the temperature is fast enough.
         PolicyKind::Mlp => {
             let text = "[pacing]\nupdates_per_segment = 1.0\n\
                         [algorithm]\naction_rate_penalty = 0.0\n\
-                        [algorithm.sac]\ntarget_entropy_per_action = -1.0";
+                        [algorithm.sac]\ntarget_entropy_per_action = -1.0\n\
+                        temperature_learning_rate = 0.0003";
             Some(text.parse().expect("the built-in defaults are valid TOML"))
         }
     }
