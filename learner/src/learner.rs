@@ -25,7 +25,7 @@ use crate::metrics::{DeliveryLine, MetricsCollector, MetricsLine, Rejected};
 use crate::normaliser::{Normaliser, RelativeGoal};
 use crate::off_policy::{CloningLosses, UpdateProgress};
 use crate::regime::Regime;
-use crate::replay::{GoalSampler, Replay, Sampler};
+use crate::replay::{GoalSampler, JerkCost, Replay, Sampler};
 use crate::update::network::TrainableNetwork;
 
 pub use crate::error::LearnerError;
@@ -92,6 +92,8 @@ pub struct Learner {
     pub sampler: Sampler,
     /// Draws goals for windows, if hindsight is configured and the environment has a goal rule.
     pub hindsight: Option<GoalSampler>,
+    /// Cost of jerk, if it is configured.
+    pub jerk_cost: Option<JerkCost>,
     /// Observation normalisation, if it is configured.
     pub normaliser: Option<Normaliser>,
     /// Progress of the run.
@@ -122,6 +124,7 @@ impl Learner {
         let regime = Regime::new(&config, &policy, spec.goal_rule.as_deref())?;
         let random = seeds::stream(config.run.seed, "replay", 0);
         let hindsight = GoalSampler::from_config(spec.goal_rule.as_deref(), &config);
+        let jerk_cost = JerkCost::from_config(&config, spec)?;
         let replay_steps = regime.replay_steps(&config, layout.segment_steps);
         Ok(Self {
             expected: Expected {
@@ -142,6 +145,7 @@ impl Learner {
                 Normaliser::new(layout.observation_len, first, relative)
             }),
             hindsight,
+            jerk_cost,
             average: (config.learner.average_share > 0.0)
                 .then(|| PolicyAverage::new(config.learner.average_share)),
             counters: Counters::default(),
@@ -203,14 +207,19 @@ impl Learner {
         if self.normaliser.as_ref().is_some_and(Normaliser::is_due) {
             self.update_normaliser()?;
         }
-        let Self { config, policy, regime, replay, sampler, hindsight, counters, .. } = self;
-        if let Some(hindsight) = hindsight {
-            hindsight.read_recent(replay);
+        if let Some(hindsight) = &mut self.hindsight {
+            hindsight.read_recent(&self.replay);
         }
-        let (normaliser, hindsight) = (self.normaliser.as_ref(), hindsight.as_ref());
+        let Self { config, policy, regime, replay, sampler, counters, .. } = self;
         match regime {
             Regime::OffPolicy(off_policy) => {
-                let source = SampleSource { replay, sampler, hindsight, normaliser };
+                let source = SampleSource {
+                    replay,
+                    sampler,
+                    hindsight: self.hindsight.as_ref(),
+                    jerk_cost: self.jerk_cost.as_ref(),
+                    normaliser: self.normaliser.as_ref(),
+                };
                 let (update, env_steps) = (counters.updates + 1, counters.env_steps);
                 let progress = UpdateProgress { update, env_steps };
                 let losses = off_policy.update(config, policy, source, progress)?;
@@ -221,6 +230,7 @@ impl Learner {
             }
             Regime::OnPolicy(ndp) => {
                 let progress = counters.env_steps as f64 / config.run.steps as f64;
+                let normaliser = self.normaliser.as_ref();
                 let context = UpdateContext { policy, normaliser, progress };
                 let losses = ndp.update(context, sampler.random_mut());
                 let named = [
@@ -299,7 +309,7 @@ impl Learner {
         self.update_normaliser()?;
         let Self { config, policy, regime, replay, sampler, .. } = self;
         let normaliser = self.normaliser.as_ref();
-        let source = SampleSource { replay, sampler, hindsight: None, normaliser };
+        let source = SampleSource { replay, sampler, hindsight: None, jerk_cost: None, normaliser };
         match regime {
             Regime::OffPolicy(off_policy) => {
                 let updates = config.demonstrations.cloning_updates;

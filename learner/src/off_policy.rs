@@ -127,10 +127,10 @@ impl OffPolicy {
     ) -> candle_core::Result<Losses> {
         let Self { algorithm, batch, next_batch, omega, .. } = self;
         let Some(next_batch) = next_batch else { return algorithm.update(policy, batch, update) };
-        let SampleSource { replay, sampler, hindsight, normaliser } = source;
+        let SampleSource { replay, sampler, hindsight, jerk_cost, normaliser } = source;
         let shape = algorithm.batch_shape();
         let sample = |next: &mut Batch, sampler: &mut Sampler| {
-            let mut source = SampleSource { replay, sampler, hindsight, normaliser };
+            let mut source = SampleSource { replay, sampler, hindsight, jerk_cost, normaliser };
             next.sample(shape, &config.algorithm, *omega, &mut source)
         };
         next_batch.sample_during(sampler, sample, || algorithm.update(policy, batch, update))

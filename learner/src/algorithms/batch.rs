@@ -191,11 +191,10 @@ impl Batch {
         omega: f32,
         source: &mut SampleSource<'_>,
     ) -> Result<(), NoWindow> {
-        let SampleSource { replay, sampler, hindsight, normaliser } = source;
-        let (replay, hindsight, normaliser) = (*replay, *hindsight, *normaliser);
+        let (replay, normaliser) = (source.replay, source.normaliser);
         let mut goal = std::mem::take(&mut self.goal);
         for row in 0..shape.rows {
-            let sample = Sample::draw(replay, hindsight, sampler, &mut goal)
+            let sample = Sample::draw(source, &mut goal)
                 .ok_or(NoWindow { segments: replay.len(), steps: replay.layout().segment_steps })?;
             self.write_states(shape, row, replay, &sample, config);
             let (o, width) = (shape.observation_len, shape.critic_inputs());
@@ -222,9 +221,9 @@ impl Batch {
             None => self.next_inputs.copy_from_slice(&self.next_observations),
         }
         for value in self.next_noise.iter_mut().chain(&mut self.noise) {
-            *value = sampler.random_mut().sample(StandardNormal);
+            *value = source.sampler.random_mut().sample(StandardNormal);
         }
-        self.target_range = target_range(hindsight, config);
+        self.target_range = target_range(source.hindsight, config);
         Ok(())
     }
 
@@ -339,13 +338,16 @@ mod tests {
     /// (s_t, actions of the window, reward, bootstrap, state to bootstrap from).
     type Row = (f32, [f32; 2], f32, f32, f32);
 
+    fn source<'a>(replay: &'a Replay, sampler: &'a mut Sampler) -> SampleSource<'a> {
+        SampleSource { replay, sampler, hindsight: None, jerk_cost: None, normaliser: None }
+    }
+
     /// Returns the distinct rows of a batch.
     fn rows(replay: &Replay, windows: Windows, target: Target) -> Vec<Row> {
         let config = AlgorithmConfig { target, discount: 0.5, ..AlgorithmConfig::default() };
         let mut sampler = Sampler::new(windows, dmprl_shared::seeds::stream(1, "test", 0));
         let mut batch = Batch::new(SHAPE);
-        let mut source =
-            SampleSource { replay, sampler: &mut sampler, hindsight: None, normaliser: None };
+        let mut source = source(replay, &mut sampler);
         batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
         let mut rows: Vec<Row> = (0..SHAPE.rows)
             .map(|row| {
@@ -413,12 +415,7 @@ mod tests {
         let replay = replay(9, &[(0, TERMINATED)]);
         let mut sampler = Sampler::new(Windows::Sliding, dmprl_shared::seeds::stream(1, "test", 0));
         let mut batch = Batch::new(SHAPE);
-        let mut source = SampleSource {
-            replay: &replay,
-            sampler: &mut sampler,
-            hindsight: None,
-            normaliser: None,
-        };
+        let mut source = source(&replay, &mut sampler);
         batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
         let mut seen = [false; 3];
         for row in 0..SHAPE.rows {
@@ -443,8 +440,7 @@ mod tests {
         let mut batch = Batch::new(SHAPE);
         let config = AlgorithmConfig::default();
         let normaliser = Some(&normaliser);
-        let mut source =
-            SampleSource { replay: &replay, sampler: &mut sampler, hindsight: None, normaliser };
+        let mut source = SampleSource { normaliser, ..source(&replay, &mut sampler) };
         batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();
         assert!(batch.observations.contains(&0.0) && batch.observations.contains(&2.0));
         for row in 0..SHAPE.rows {
@@ -476,12 +472,7 @@ mod tests {
         let mut sampler = Sampler::new(Windows::Sliding, random);
         let mut batch = Batch::new(shape);
         let config = AlgorithmConfig::default();
-        let mut source = SampleSource {
-            replay: &replay,
-            sampler: &mut sampler,
-            hindsight: None,
-            normaliser: None,
-        };
+        let mut source = source(&replay, &mut sampler);
         batch.sample(shape, &config, 2.0, &mut source).unwrap();
         let mut ends = [None; 3];
         for input in batch.critic_inputs.chunks_exact(7) {

@@ -61,6 +61,7 @@ fn rows_of(
         replay,
         sampler: &mut sampler,
         hindsight: hindsight.as_ref(),
+        jerk_cost: None,
         normaliser: None,
     };
     batch.sample(SHAPE, config, 1.0, &mut source).unwrap();
@@ -167,6 +168,7 @@ fn whole_windows_that_led_to_their_goal_are_imitated() {
             replay: &replay,
             sampler: &mut sampler,
             hindsight: hindsight.as_ref(),
+            jerk_cost: None,
             normaliser: None,
         };
         batch.sample(SHAPE, &config, 1.0, &mut source).unwrap();

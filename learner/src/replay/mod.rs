@@ -9,6 +9,7 @@ mod block_store;
 mod episodes;
 mod file;
 mod hindsight;
+mod jerk;
 mod led_to_goal;
 mod motion;
 mod recent;
@@ -23,6 +24,7 @@ use block_store::BlockStore;
 use episodes::{Episodes, Place};
 pub use file::ReplayFileError;
 pub use hindsight::{Goal, GoalSampler, Outcome};
+pub use jerk::JerkCost;
 pub use sampler::Sampler;
 pub use window::Window;
 

@@ -130,6 +130,13 @@ impl Replay {
         })
     }
 
+    /// Returns the observation before the window's first one, (O,), or `None` where there is no
+    /// action before it.
+    pub(super) fn observation_before(&self, window: &Window) -> Option<&[f32]> {
+        let (slot, step) = self.step_before(window.slot, window.offset.into())?;
+        Some(self.observation_row(slot, step))
+    }
+
     /// Returns slot and step before those of a step in the same episode.
     fn step_before(&self, slot: u32, step: usize) -> Option<(u32, usize)> {
         if let Some(step) = step.checked_sub(1) {

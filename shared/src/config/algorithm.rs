@@ -87,6 +87,11 @@ pub struct AlgorithmConfig {
     /// The same for the action acceleration: the penalty is the sum of
     /// (u_{t+1} - 2 u_t + u_{t-1})². Actions before the first one are read from the replay.
     pub action_acceleration_penalty: f64,
+    /// Reward that a step loses for each unit of jerk, when a batch is sampled (not with `ndp`).
+    /// The jerk is the mean |v_{t+1} - 2 v_t + v_{t-1}| / dt² over the velocities of
+    /// `task.start_sources` \[rad/s³ or m/s³\], where dt is the time of a step, or 1 if the
+    /// environment does not report it. Evaluations and reports have the task's own rewards.
+    pub jerk_cost: f64,
     /// Weight of a penalty on saturation in the actor's loss (not with `ndp`), relative to the
     /// batch's mean |Q|. The penalty is the sum of max(|x| - 2, 0)² over all numbers x of a
     /// decision that get a tanh: the outputs for goal, weights and rho, and the actions before
@@ -219,6 +224,7 @@ impl Default for AlgorithmConfig {
             critic_layer_norm: false,
             action_rate_penalty: 0.2,
             action_acceleration_penalty: 0.0,
+            jerk_cost: 0.0,
             saturation_penalty: 0.0,
             imitation_penalty: 0.0,
             motion_bonus: 0.0,

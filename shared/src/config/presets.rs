@@ -125,6 +125,7 @@ critic_hidden = [256, 256]
 critic_layer_norm = false
 action_rate_penalty = 0.0
 action_acceleration_penalty = 0.0
+jerk_cost = 0.0
 saturation_penalty = 0.0
 imitation_penalty = 0.0
 motion_bonus = 0.0

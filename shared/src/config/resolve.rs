@@ -289,6 +289,13 @@ impl ExperimentConfig {
                 "zero, carry or action; task `{}` has no task.start_sources to read y0 from",
                 self.task.name
             )
+        })?;
+        let cost = self.algorithm.jerk_cost;
+        range("algorithm.jerk_cost", cost, cost == 0.0 || sources > 0, || {
+            format!(
+                "0; task `{}` has no task.start_sources to read velocities from",
+                self.task.name
+            )
         })
     }
 }
@@ -390,6 +397,7 @@ mod tests {
             ("algorithm.polyak", "nan"),
             ("algorithm.action_rate_penalty", "-0.1"),
             ("algorithm.action_acceleration_penalty", "inf"),
+            ("algorithm.jerk_cost", "-0.1"),
             ("algorithm.saturation_penalty", "-1"),
             ("algorithm.imitation_penalty", "-1"),
             ("learner.average_share", "1.5"),

@@ -193,9 +193,10 @@ impl SampleWork {
         let config = learner.config().algorithm.clone();
         let Self { batch, shape, omega } = self;
         timed(duration, || {
-            let Learner { replay, sampler, hindsight, normaliser, .. } = &mut *learner;
-            let (hindsight, normaliser) = (hindsight.as_ref(), normaliser.as_ref());
-            let mut source = SampleSource { replay, sampler, hindsight, normaliser };
+            let Learner { replay, sampler, hindsight, jerk_cost, normaliser, .. } = &mut *learner;
+            let (hindsight, jerk_cost) = (hindsight.as_ref(), jerk_cost.as_ref());
+            let normaliser = normaliser.as_ref();
+            let mut source = SampleSource { replay, sampler, hindsight, jerk_cost, normaliser };
             Ok(batch.sample(*shape, &config, *omega, &mut source)?)
         })
     }

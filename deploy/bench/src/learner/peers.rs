@@ -129,9 +129,10 @@ fn unsupported(config: &ExperimentConfig) -> Option<&'static str> {
             algorithm.action_rate_penalty
                 + algorithm.action_acceleration_penalty
                 + algorithm.saturation_penalty
+                + algorithm.jerk_cost
                 > 0.0,
-            "tests/peers has no algorithm.action_rate_penalty, action_acceleration_penalty or \
-             saturation_penalty",
+            "tests/peers has no algorithm.action_rate_penalty, action_acceleration_penalty, \
+             saturation_penalty or jerk_cost",
         ),
     ];
     differences.into_iter().find_map(|(differs, why)| differs.then_some(why))

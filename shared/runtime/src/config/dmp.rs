@@ -266,6 +266,16 @@ pub enum StartSource {
     },
 }
 
+impl StartSource {
+    /// Returns the index of the velocity.
+    #[must_use]
+    pub fn velocity(&self) -> usize {
+        match self {
+            Self::Angle { velocity, .. } | Self::Value { velocity, .. } => *velocity,
+        }
+    }
+}
+
 fn unit_scale() -> f32 {
     1.0
 }

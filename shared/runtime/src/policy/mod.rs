@@ -40,6 +40,7 @@ pub use learned_std::LearnedStd;
 pub use matrix::{Keep, Matrix, product};
 pub use network::{Activations, Layer, MlpShape, SmallBatchNetwork, forward, initial_parameters};
 pub use plan::Plan;
+pub use start::check_start_sources;
 pub use tanh::tanh;
 
 use crate::config::{Controller, PolicyKind, RangeError};

@@ -36,7 +36,7 @@ impl StartState {
             Start::Zero => Ok(Self::Zero),
             Start::Carry | Start::Action => Ok(Self::Appended { at: spec.observation_len }),
             Start::Observed => {
-                check(start_sources, spec)?;
+                check_start_sources(start_sources, spec)?;
                 let segment_s = policy.segment_steps as f64 * spec.control_dt_s;
                 let measured = policy.start_velocity == StartVelocity::Measured;
                 let velocity_scale = if measured { segment_s as f32 } else { 0.0 };
@@ -65,7 +65,11 @@ impl StartState {
     }
 }
 
-fn check(sources: &[StartSource], spec: &EnvSpec) -> Result<(), PolicyError> {
+/// Checks that there is a source for each action dimension, with entries of the observation.
+///
+/// # Errors
+/// `StartSources` if not.
+pub fn check_start_sources(sources: &[StartSource], spec: &EnvSpec) -> Result<(), PolicyError> {
     if sources.len() != spec.action_len {
         return Err(PolicyError::StartSources(format!(
             "{} entries, expected one for each of the {} action dimensions of {}",

@@ -67,6 +67,7 @@ impl ExperimentConfig {
         for (key, penalty) in [
             ("algorithm.action_rate_penalty", self.algorithm.action_rate_penalty),
             ("algorithm.action_acceleration_penalty", self.algorithm.action_acceleration_penalty),
+            ("algorithm.jerk_cost", self.algorithm.jerk_cost),
             ("algorithm.imitation_penalty", self.algorithm.imitation_penalty),
             ("algorithm.saturation_penalty", self.algorithm.saturation_penalty),
         ] {
