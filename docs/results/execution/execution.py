@@ -1,4 +1,4 @@
-"""Ways to execute the segments of a policy: ``python execution.py LABEL POLICY TASK EPISODES``.
+"""Ways to execute a policy: ``python execution.py LABEL POLICY TASK EPISODES [FIRST_SEED]``.
 
 POLICY is a run directory or ``zoo:TASK``. It prints a line of CSV for each way: ``segment`` is
 whole segments, ``first`` decides at every step and executes the first action, ``mean`` executes the
@@ -100,35 +100,35 @@ def episode(env, executed: Executed, seed: int, joints: list[int]) -> tuple[floa
     return total, float(info.get("is_success", np.nan)), *changes
 
 
-def lines(label: str, name: str, task: str, episodes: int) -> Iterator[str]:
-    """Yields the lines of a policy."""
+def lines(label: str, name: str, task: str, seeds: range) -> Iterator[str]:
+    """Yields the lines of a policy, for episodes with these seeds."""
     policy = (
         dmprl.Policy.load(name)
         if name.startswith("zoo:")
         else dmprl.Run(Path(name)).policy("latest")
     )
     env = dmprl.make(task)
-    env.reset(seed=FIRST_SEED)
+    env.reset(seed=seeds[0])
     joints, step_s = robot_joints(state(env)[0]).qvel, policy.spec["control_dt_s"]
     first = None
     for way in WAYS if policy.segment_steps > 1 else WAYS_OF_MLP:
         executed = Executed(policy, way)
-        seeds = range(FIRST_SEED, FIRST_SEED + episodes)
         rows = np.array([episode(env, executed, seed, joints) for seed in seeds])
         first = rows if first is None else first
         change = rows[:, 0] - first[:, 0]
         mean = rows.mean(axis=0)
-        values = (mean[0], change.mean(), change.std() / np.sqrt(episodes), *mean[1:4])
+        values = (mean[0], change.mean(), change.std() / np.sqrt(len(seeds)), *mean[1:4])
         numbers = ",".join(f"{value:.4f}" for value in values)
-        yield f"{label},{task},{way},{episodes},{numbers},{mean[4] / step_s**2:.1f}"
+        yield f"{label},{task},{way},{len(seeds)},{numbers},{mean[4] / step_s**2:.1f}"
 
 
 def main() -> None:
     """Prints the lines of the command line's policy."""
     repair()
-    label, name, task, episodes = sys.argv[1:]
+    label, name, task, episodes, *first = sys.argv[1:]
+    first_seed = int(first[0]) if first else FIRST_SEED
     print(",".join(["policy", "task", "execution", "episodes", *COLUMNS]))
-    for line in lines(label, name, task, int(episodes)):
+    for line in lines(label, name, task, range(first_seed, first_seed + int(episodes))):
         print(line, flush=True)
 
 

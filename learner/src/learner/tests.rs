@@ -1,6 +1,6 @@
 //! Tests of the learner, and what other tests need of it.
 
-use dmprl_shared::config::Hindsight;
+use dmprl_shared::config::{Hindsight, StartSource};
 use dmprl_shared::goal_rule::{GoalReward, GoalRule, Norm};
 use dmprl_shared::segment::{SegmentHeader, TRUNCATED};
 
@@ -46,6 +46,29 @@ fn a_snapshot_is_settled_if_half_of_the_recent_episodes_move_the_achieved_goal()
         // No update has been made, as after a resume.
         assert_eq!(learner.next_snapshot().unwrap().settled, expected, "{moving} of 100");
     }
+}
+
+#[test]
+fn updates_learn_from_the_cost_of_jerk() {
+    let actor = |cost: f64| {
+        let mut config = ExperimentConfig::default();
+        config.algorithm.jerk_cost = cost;
+        let source = |velocity| StartSource::Value { index: 0, velocity, scale: 1.0 };
+        config.task.start_sources = vec![source(2), source(3)];
+        let mut learner = Learner::new(config, &spec(), 1).unwrap();
+        let layout = learner.replay.layout();
+        let block: Vec<f32> = (0..layout.block_len()).map(|i| (i * i % 7) as f32 / 7.0).collect();
+        let steps_len = layout.segment_steps as u32;
+        let header = SegmentHeader { steps_len, flags: TRUNCATED, ..Default::default() };
+        learner.replay.insert(&header, &block);
+        (0..4).for_each(|_| learner.update().unwrap());
+        let mut actor = vec![0.0; learner.policy().parameters_len()];
+        learner.regime.read_policy(&mut actor).unwrap();
+        actor
+    };
+    let without = actor(0.0);
+    assert_eq!(without, actor(0.0));
+    assert_ne!(without, actor(0.1));
 }
 
 #[test]
