@@ -1,13 +1,15 @@
 //! Workers that join a running run, and leave it.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::fs::chown;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use dmprl_tests::program::{
-    Process, Running, Workplace, env_steps_of, rows, shared_memory_of, until,
+    PATIENCE, Process, Running, Workplace, env_steps_of, rows, shared_memory_of, until,
 };
 use dmprl_tests::skipped::skipped;
 use rustix::process::Signal;
@@ -141,24 +143,33 @@ fn processes(place: &Workplace, role: &str) -> Vec<Process> {
     place.processes().into_iter().filter(|process| process.role == role).collect()
 }
 
-/// Counts open files of supervisor and learner, and files in shared memory.
-fn held(place: &Workplace, run: &str) -> (Vec<usize>, usize) {
-    let files = ["train", "learner"].into_iter().flat_map(|role| processes(place, role));
-    let files = files.map(|process| {
-        let folder = format!("/proc/{}/fd", process.id.as_raw_nonzero());
-        fs::read_dir(folder).map_or(0, Iterator::count)
-    });
+/// Counts open files of supervisor and learner, and files in shared memory, by their names without
+/// digits.
+fn held(place: &Workplace, run: &str) -> BTreeMap<String, usize> {
+    let mut names = Vec::new();
+    for role in ["train", "learner"] {
+        for process in processes(place, role) {
+            let folder = format!("/proc/{}/fd", process.id.as_raw_nonzero());
+            let open = fs::read_dir(folder).into_iter().flatten().flatten();
+            let targets = open.filter_map(|entry| fs::read_link(entry.path()).ok());
+            names.extend(targets.map(|target| format!("{role} has open {}", target.display())));
+        }
+    }
     let mut folders = shared_memory_of(run);
-    let mut count = 0;
     while let Some(folder) = folders.pop() {
         for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-            count += 1;
+            names.push(entry.path().display().to_string());
             if entry.path().is_dir() {
                 folders.push(entry.path());
             }
         }
     }
-    (files.collect(), count)
+    let mut counts = BTreeMap::new();
+    for mut name in names {
+        name.retain(|letter| !letter.is_ascii_digit());
+        *counts.entry(name).or_default() += 1;
+    }
+    counts
 }
 
 #[test]
@@ -192,21 +203,25 @@ fn joining_and_leaving_all_the_time_leaks_nothing() {
         running.until("its end is noticed", gone);
         if before.is_none() {
             until_learned_from_own(&mut running, &run);
-            // Which stays open from the first line of metrics.
-            running.until("its event file", |_| Path::new(&run).join("tensorboard").is_dir());
+            // Which stays open from the first line of metrics. The folder exists a moment earlier.
+            let events = Path::new(&run).join("tensorboard");
+            running.until("its event file", |_| {
+                fs::read_dir(&events).is_ok_and(|mut entries| entries.next().is_some())
+            });
             before = Some(held(&place, &run));
         }
     }
     let before = before.unwrap();
-    // The first count may contain a file that was open for a moment, so the last may be lower. Nine
-    // workers that leave something behind are more than that.
-    running.until("nothing of them is left", |_| {
-        let after = held(&place, &run);
-        let is_more = |(after, before): (&usize, &usize)| after > before;
-        after.0.len() == before.0.len()
-            && !after.0.iter().zip(&before.0).any(is_more)
-            && after.1 <= before.1
-    });
+    let more = || {
+        let mut after = held(&place, &run);
+        after.retain(|name, count| *count > before.get(name).copied().unwrap_or(0));
+        after
+    };
+    let deadline = Instant::now() + PATIENCE;
+    // Both also open some files for a moment.
+    while !more().is_empty() {
+        assert!(Instant::now() < deadline, "left behind: {:#?}", more());
+    }
     end(&place, &run, running);
 }
 
