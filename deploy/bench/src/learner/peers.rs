@@ -70,7 +70,8 @@ impl Peer {
         if let Some(why) = unsupported(&bench.config) {
             bail!("{}", why);
         }
-        let settings = folder.join("settings.json");
+        // A file of its own: the next peer's must not be written while this one reads.
+        let settings = folder.join(format!("{}.json", kind.name()));
         std::fs::write(&settings, settings_of(&bench.config, &bench.spec).to_string())
             .with_context(|| format!("cannot write {}", settings.display()))?;
         let log_path = folder.join(format!("{}.log", kind.name()));
