@@ -256,7 +256,7 @@ mod tests {
         layers.set("--set", "dmp.alpha_y", "8").unwrap();
         let config = layers.finish().unwrap();
         assert_eq!((config.dmp.alpha_y, config.dmp.basis_count), (8.0, 3));
-        assert_eq!(config.algorithm.batch_size, 256);
+        assert_eq!(config.algorithm.batch_size, 128);
     }
 
     #[test]

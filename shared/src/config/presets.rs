@@ -28,8 +28,8 @@ pub const PRESETS: [Preset; 4] = [
     },
     Preset {
         name: "fast",
-        about: "least wall time: two update threads, smaller batches, and frequent evaluations, so \
-                that --until-return and --until-success stop the run early",
+        about: "least wall time: two update threads, and frequent evaluations, so that \
+                --until-return and --until-success stop the run early",
         text: FAST,
     },
     Preset {
@@ -39,11 +39,8 @@ pub const PRESETS: [Preset; 4] = [
     },
 ];
 
-// An update with a batch of 128 takes half the time, and good policies come sooner
-// (docs/decisions/0118-smaller-batches-in-fast.md). Easy tasks have smaller networks (`tasks.rs`).
+// Easy tasks have smaller networks (`tasks.rs`, docs/decisions/0118-smaller-batches-in-fast.md).
 const FAST: &str = r#"
-[algorithm]
-batch_size = 128
 [learner]
 threads = 2
 [evaluation]
@@ -57,7 +54,6 @@ const GOAL: &str = r#"
 [algorithm]
 discount = 0.98
 actor_learning_rate = 0.0003
-batch_size = 128
 action_rate_penalty = 0.0
 saturation_penalty = 0.003
 imitation_penalty = 0.1

@@ -269,12 +269,12 @@ pub(super) mod tests {
         close("share_of_limit", 0.6);
         close("cpu_ratio_to_floor", 1.25);
         close("updates_per_s", 100.0);
-        close("samples_per_s", 25_600.0);
+        close("samples_per_s", 12_800.0);
         close("peer_torch_ms", 16.0);
         close("peer_torch_to_ours", 1.6);
         close("peak_memory_mb", 50.0);
         assert_eq!(json["floor"], "kernels");
-        assert_eq!((&json["batch_size"], &json["threads"]), (&256.into(), &1.into()));
+        assert_eq!((&json["batch_size"], &json["threads"]), (&128.into(), &1.into()));
         for absent in ["peer_jax_ms", "peer_jax_to_ours"] {
             assert!(json[absent].is_null() && json.get(absent).is_some(), "{absent}");
         }
