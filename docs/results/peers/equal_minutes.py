@@ -52,11 +52,10 @@ class Result(NamedTuple):
 
 
 def iqm(scores: np.ndarray) -> np.ndarray:
-    """Returns the means of the middle halves along the last axis. Scores count in part."""
+    """Returns the means along the last axis, without a quarter of the scores at each end."""
     ordered, count = np.sort(scores, axis=-1), scores.shape[-1]
-    edges = np.arange(count + 1)
-    inside = np.clip(edges, count / 4, 3 * count / 4)
-    return ordered @ np.diff(inside) / (count / 2)
+    cut = count // 4
+    return ordered[..., cut : count - cut].mean(axis=-1)
 
 
 def result(scores: np.ndarray) -> Result:

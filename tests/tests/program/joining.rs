@@ -148,7 +148,9 @@ fn processes(place: &Workplace, role: &str) -> Vec<Process> {
 fn held(place: &Workplace, run: &str) -> BTreeMap<String, usize> {
     let mut names = Vec::new();
     for role in ["train", "learner"] {
-        for process in processes(place, role) {
+        let processes = processes(place, role);
+        assert!(!processes.is_empty(), "a process {role}");
+        for process in processes {
             let folder = format!("/proc/{}/fd", process.id.as_raw_nonzero());
             let open = fs::read_dir(folder).into_iter().flatten().flatten();
             let targets = open.filter_map(|entry| fs::read_link(entry.path()).ok());
@@ -218,9 +220,11 @@ fn joining_and_leaving_all_the_time_leaks_nothing() {
         after
     };
     let deadline = Instant::now() + PATIENCE;
+    let mut left = more();
     // Both also open some files for a moment.
-    while !more().is_empty() {
-        assert!(Instant::now() < deadline, "left behind: {:#?}", more());
+    while !left.is_empty() {
+        assert!(Instant::now() < deadline, "left behind: {left:#?}");
+        left = more();
     }
     end(&place, &run, running);
 }
