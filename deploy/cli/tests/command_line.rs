@@ -76,7 +76,7 @@ fn invalid_values_are_usage_errors() {
         &["train"][..],
         &["train", "reacher", "--steps", "0"],
         &["train", "reacher", "--steps", "-5"],
-        &["train", "reacher", "--threads", "0"],
+        &["train", "reacher", "--threads", "2000"],
         #[cfg(not(feature = "cuda"))]
         &["train", "reacher", "--device", "cuda"],
         #[cfg(not(feature = "cuda"))]

@@ -45,9 +45,9 @@ pub struct LearnerConfig {
     pub device: Device,
     /// What computes an update.
     pub backend: Backend,
-    /// Threads that compute an update by kernels. Results are bit-identical for every number of
-    /// threads. A graph on the CPU uses one, unless the environment variable `RAYON_NUM_THREADS`
-    /// has more.
+    /// Threads that compute an update by kernels; 0 means 2, or 1 on a machine with one core.
+    /// Results are bit-identical for every number of threads. A graph on the CPU uses one, unless
+    /// the environment variable `RAYON_NUM_THREADS` has more.
     pub threads: usize,
     /// Precision of the multiplications in an update. Sums and parameters are always f32.
     pub precision: Precision,
@@ -63,7 +63,7 @@ impl Default for LearnerConfig {
         Self {
             device: Device::Cpu,
             backend: Backend::Auto,
-            threads: 1,
+            threads: 0,
             precision: Precision::F32,
             publish_every_updates: 4,
             average_share: 0.05,

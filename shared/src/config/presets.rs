@@ -28,8 +28,8 @@ pub const PRESETS: [Preset; 4] = [
     },
     Preset {
         name: "fast",
-        about: "least wall time: two update threads, and frequent evaluations, so that \
-                --until-return and --until-success stop the run early",
+        about: "least wall time: frequent evaluations, so that --until-return and \
+                --until-success stop the run early",
         text: FAST,
     },
     Preset {
@@ -41,8 +41,6 @@ pub const PRESETS: [Preset; 4] = [
 
 // Easy tasks have smaller networks (`tasks.rs`, docs/decisions/0118-smaller-batches-in-fast.md).
 const FAST: &str = r#"
-[learner]
-threads = 2
 [evaluation]
 interval_steps = 1000
 "#;

@@ -17,6 +17,8 @@ pub struct Limits {
 
 /// No experiment needs more; a larger value is probably a typo.
 const WORKERS_MAX: usize = 1_024;
+/// A thread takes 64 rows of a batch at a time, so more would share the default's 128 unevenly.
+const UPDATE_THREADS: usize = 2;
 const ENVS_PER_WORKER_MAX: usize = 4_096;
 const HINDSIGHT_COPIES_MAX: usize = 64;
 /// Enough for a worker that sends 100 000 segments per second and gets 100 acknowledgements per
@@ -46,6 +48,9 @@ impl ExperimentConfig {
     pub fn resolve(mut self, limits: Limits) -> Result<Self, ConfigError> {
         if self.actors.workers == 0 {
             self.actors.workers = limits.cores.saturating_sub(1).max(1);
+        }
+        if self.learner.threads == 0 {
+            self.learner.threads = limits.cores.clamp(1, UPDATE_THREADS);
         }
         if self.actors.queue_segments == 0 {
             self.actors.queue_segments = self.actors.envs_per_worker;
@@ -325,6 +330,16 @@ mod tests {
                 layers.finish().unwrap().resolve(LIMITS).unwrap();
             }
         }
+    }
+
+    #[test]
+    fn the_update_has_two_threads_on_two_cores() {
+        let threads = |cores| {
+            let layers = Layers::new().finish().unwrap();
+            layers.resolve(Limits { cores }).unwrap().learner.threads
+        };
+        assert_eq!([1, 2, 16].map(threads), [1, 2, 2]);
+        assert_eq!(resolved(&[("learner.threads", "3")]).unwrap().learner.threads, 3);
     }
 
     #[test]

@@ -274,7 +274,7 @@ pub(super) mod tests {
         close("peer_torch_to_ours", 1.6);
         close("peak_memory_mb", 50.0);
         assert_eq!(json["floor"], "kernels");
-        assert_eq!((&json["batch_size"], &json["threads"]), (&128.into(), &1.into()));
+        assert_eq!((&json["batch_size"], &json["threads"]), (&128.into(), &2.into()));
         for absent in ["peer_jax_ms", "peer_jax_to_ours"] {
             assert!(json[absent].is_null() && json.get(absent).is_some(), "{absent}");
         }

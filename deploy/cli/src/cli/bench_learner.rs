@@ -55,7 +55,7 @@ pub(super) struct LearnerArgs {
     /// Device of the update; `cuda` needs a build with that feature.
     #[arg(long, value_parser = PossibleValuesParser::new(["cpu", "cuda"]))]
     device: Option<String>,
-    /// Threads of the update and of the peers.
+    /// Threads of the update and of the peers [default: 2, or 1 on one core].
     #[arg(long, value_name = "N")]
     threads: Option<u32>,
     /// Numbers in an observation [default: the task's].

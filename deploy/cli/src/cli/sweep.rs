@@ -184,12 +184,12 @@ fn default_output(file: &Path) -> anyhow::Result<PathBuf> {
 }
 
 /// Returns the number of concurrent runs: as given, or as many as have a core for each worker and
-/// each learner thread.
+/// for the learner. Workers wait most of the time, so the learner's second thread uses their cores.
 pub(super) fn jobs<'a>(
     args: &SweepArgs,
     runs: impl Iterator<Item = &'a ExperimentConfig>,
 ) -> usize {
-    let wanted = |config: &ExperimentConfig| config.actors.workers + config.learner.threads;
+    let wanted = |config: &ExperimentConfig| config.learner.threads.max(config.actors.workers + 1);
     let most = runs.map(wanted).max().unwrap_or(1);
     args.jobs.map_or_else(|| (cores() / most.max(1)).max(1), usize::from)
 }

@@ -73,7 +73,7 @@ pub(super) struct TrainArgs {
     /// Device of the update; `cuda` needs a build with that feature.
     #[arg(long, value_parser = PossibleValuesParser::new(["cpu", "cuda"]))]
     device: Option<String>,
-    /// Threads of the update.
+    /// Threads of the update [default: 2, or 1 on one core].
     #[arg(long, value_name = "N")]
     threads: Option<u32>,
     /// Initialise the policy from a run's best policy, zoo:TASK or a policy file.
