@@ -75,7 +75,7 @@ pub(super) struct SweepArgs {
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
     /// Concurrent runs, or trials in a search [default: as many as fit the cores, with one per
-    /// worker and learner thread].
+    /// worker and one for the learner].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub(super) jobs: Option<u16>,
     /// Only list the runs, or a search's space and trials, with their progress.
