@@ -142,7 +142,7 @@ pub(super) fn run(args: &BridgeArgs) -> anyhow::Result<Outcome> {
     };
     let (program, session) = (this_program()?, welcome.lease.session);
     let style = args.output.style();
-    let mut observer = host_observer(style, config.run.steps);
+    let mut observer = host_observer(style, &config.run);
     let plan = HostPlan { program, run, lock: lock.watch(), config, venv, upstream, session };
     let report = launch::host(plan, observer.as_mut())?;
     drop(lock);

@@ -1,6 +1,7 @@
 //! Flags that determine how a run shows its progress.
 
 use clap::{Args, ValueEnum};
+use dmprl_shared::config::RunConfig;
 use dmprl_supervisor::RunObserver;
 
 use crate::terminal::{Display, ProgressStyle, events};
@@ -35,17 +36,17 @@ impl OutputArgs {
 }
 
 /// Makes the observer of a run in this style.
-pub(super) fn observer(style: ProgressStyle, steps_total: u64) -> Box<dyn RunObserver> {
+pub(super) fn observer(style: ProgressStyle, run: &RunConfig) -> Box<dyn RunObserver> {
     match style {
         ProgressStyle::Events => Box::new(events::EventLines::new()),
-        style => Box::new(Display::new(style, steps_total)),
+        style => Box::new(Display::new(style, run.steps).within(run.max_minutes)),
     }
 }
 
 /// Makes the observer of a host without a learner in this style.
-pub(super) fn host_observer(style: ProgressStyle, steps_total: u64) -> Box<dyn RunObserver> {
+pub(super) fn host_observer(style: ProgressStyle, run: &RunConfig) -> Box<dyn RunObserver> {
     match style {
-        ProgressStyle::Events => observer(style, steps_total),
-        style => Box::new(Display::new(style, steps_total).of_host()),
+        ProgressStyle::Events => observer(style, run),
+        style => Box::new(Display::new(style, run.steps).of_host()),
     }
 }

@@ -76,7 +76,7 @@ pub fn train_session(plan: TrainingPlan) -> anyhow::Result<Outcome> {
     let TrainingPlan { program, run, lock, config, venv, resume, progress, trial } = plan;
     let (title, steps_total) = (title(&config), config.run.steps);
     let mut session_observer = SessionObserver {
-        display: observer(progress, steps_total),
+        display: observer(progress, &config.run),
         mirrored: run.clone(),
         mirror: None,
     };

@@ -33,6 +33,8 @@ pub struct Display {
     target: Target,
     scope: Scope,
     steps_total: u64,
+    /// When the time limit of the run ends it.
+    ends: Option<Instant>,
     line_at: Option<Instant>,
     /// Evaluations, oldest first.
     evaluations: Vec<EvaluationRow>,
@@ -68,6 +70,13 @@ impl Display {
         Self { scope: Scope::Host, ..self }
     }
 
+    /// Sets the time limit of the run, which starts now \[min\]; inf: none.
+    #[must_use]
+    pub fn within(self, minutes: f64) -> Self {
+        let limit = Duration::try_from_secs_f64(minutes * 60.0).ok();
+        Self { ends: limit.and_then(|limit| Instant::now().checked_add(limit)), ..self }
+    }
+
     /// Writes plain lines to any writer.
     #[must_use]
     pub fn lines(writer: Box<dyn Write + Send>, steps_total: u64) -> Self {
@@ -79,6 +88,7 @@ impl Display {
             target,
             scope: Scope::Run,
             steps_total,
+            ends: None,
             line_at: None,
             evaluations: Vec::new(),
             last: Progress::default(),
@@ -145,7 +155,10 @@ impl Display {
     fn steps(&self, progress: &Progress) -> String {
         let steps = format!("{}/{} steps", grouped(progress.env_steps), grouped(self.steps_total));
         let left = self.steps_total.saturating_sub(progress.env_steps) as f64;
-        let eta = left / progress.env_steps_per_s;
+        let limit = self.ends.map(|ends| ends.saturating_duration_since(Instant::now()));
+        let eta = limit
+            .map_or(f64::INFINITY, |limit| limit.as_secs_f64())
+            .min(left / progress.env_steps_per_s);
         // No remaining time for a rate of zero, for more than three years, or for a host, which has
         // only part of the run's workers.
         if self.scope == Scope::Run && (1e-9..1e8).contains(&eta) {
@@ -246,6 +259,20 @@ mod tests {
         assert_eq!(display.steps(&progress), "250/1,000 steps");
         let figures = display.figures(&progress);
         assert_eq!(figures, "50 steps/s here · 0 queued · 10 segments acknowledged");
+    }
+
+    #[test]
+    fn a_run_with_a_time_limit_shows_the_time_left_of_it() {
+        let display = Display::lines(Box::new(Shared::default()), 1_000_000).within(120.0);
+        let shown = |env_steps_per_s| {
+            display.steps(&Progress { env_steps: 1, env_steps_per_s, ..Progress::default() })
+        };
+        for slow in [0.0, 1.0] {
+            let text = shown(slow);
+            let minutes = text.split_once("eta 1 h ").map(|(_, minutes)| minutes.to_owned());
+            assert_eq!(minutes.as_deref(), Some("59 min"), "{text}");
+        }
+        assert!(shown(1e5).ends_with("eta 9 s"), "{}", shown(1e5));
     }
 
     #[test]
