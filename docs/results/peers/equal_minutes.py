@@ -1,6 +1,6 @@
-"""Prints the table of ``equal-minutes.csv``, and draws ``equal-minutes.svg``, without arguments.
+"""Prints the tables of ``equal-minutes*.csv``, and draws a figure of each, without arguments.
 
-Both show the interquartile mean over seeds with a 95 % bootstrap interval. Fewer than four seeds
+They show the interquartile mean over seeds with a 95 % bootstrap interval. Fewer than four seeds
 have a mean, with the range.
 """
 
@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 FOLDER = Path(__file__).parent
+FILES = ("equal-minutes-two-cores", "equal-minutes")
+"""Data, and the names of the figures."""
 TASKS = {
     "pusher-v0": "pusher-v0",
     "thrower-v0": "thrower-v0",
@@ -36,7 +38,7 @@ SEEDS_MIN = 4
 """Seeds from which there is an interquartile mean."""
 SAMPLES = 10_000
 WIDTH, HEIGHT, COLUMNS = 300, 150, 3
-"""Size of a panel, and panels in a row."""
+"""Size of a panel with all methods, and panels in a row."""
 LEFT, RIGHT, TOP, STEP = 62, 22, 38, 20
 """Margins of a panel, and the height of a row."""
 COLOURS, OTHERS = {"ours": "#0072B2", "before": "#D55E00"}, "#777777"
@@ -68,9 +70,9 @@ def result(scores: np.ndarray) -> Result:
     return Result(float(iqm(scores)), float(low), float(high), count)
 
 
-def results() -> dict[str, dict[str, Result]]:
-    """Returns the results by task and method."""
-    with (FOLDER / "equal-minutes.csv").open(newline="") as file:
+def results(path: Path) -> dict[str, dict[str, Result]]:
+    """Reads the results by task and method."""
+    with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     found: dict[str, dict[str, Result]] = {}
     for task, title in TASKS.items():
@@ -103,12 +105,13 @@ def cell(result: Result, is_success: bool) -> str:
 
 def table(found: dict[str, dict[str, Result]]) -> Iterator[str]:
     """Yields the table's lines."""
-    yield f"| Task | {' | '.join(METHODS.values())} |"
-    yield "|---" * (len(METHODS) + 1) + "|"
+    present = [method for method in METHODS if any(method in methods for methods in found.values())]
+    yield f"| Task | {' | '.join(METHODS[method] for method in present)} |"
+    yield "|---" * (len(present) + 1) + "|"
     for task, methods in found.items():
         is_success = TASKS[task].endswith("success")
         cells = [
-            cell(methods[method], is_success) if method in methods else "" for method in METHODS
+            cell(methods[method], is_success) if method in methods else "" for method in present
         ]
         yield f"| {TASKS[task]} | {' | '.join(cells)} |"
 
@@ -144,24 +147,26 @@ def panel(task: str, methods: dict[str, Result]) -> Iterator[str]:
 
 def figure(found: dict[str, dict[str, Result]]) -> str:
     """Returns the figure."""
-    height = HEIGHT * -(-len(found) // COLUMNS)
+    panel_height = HEIGHT - STEP * (len(METHODS) - max(len(methods) for methods in found.values()))
+    height = panel_height * -(-len(found) // COLUMNS)
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH * COLUMNS} {height}" '
         'font-family="sans-serif" font-size="11" fill="#222222">',
         f'<rect width="{WIDTH * COLUMNS}" height="{height}" fill="#FFFFFF"/>',
     ]
     for index, (task, methods) in enumerate(found.items()):
-        x, y = WIDTH * (index % COLUMNS), HEIGHT * (index // COLUMNS)
+        x, y = WIDTH * (index % COLUMNS), panel_height * (index // COLUMNS)
         elements = "\n".join(panel(task, methods))
         parts.append(f'<g transform="translate({x} {y})">\n{elements}\n</g>')
     return "\n".join([*parts, "</svg>\n"])
 
 
 def main() -> None:
-    """Prints the table and writes the figure."""
-    found = results()
-    print("\n".join(table(found)))
-    (FOLDER / "equal-minutes.svg").write_text(figure(found))
+    """Prints the tables and writes the figures."""
+    for name in FILES:
+        found = results(FOLDER / f"{name}.csv")
+        print("\n".join(table(found)))
+        (FOLDER / f"{name}.svg").write_text(figure(found))
 
 
 if __name__ == "__main__":
