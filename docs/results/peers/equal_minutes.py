@@ -45,12 +45,14 @@ COLOURS, OTHERS = {"ours": "#0072B2", "before": "#D55E00"}, "#777777"
 
 
 class Result(NamedTuple):
-    """A method's result on a task."""
+    """A method's result on a task, or the difference of two."""
 
     middle: float
     low: float
     high: float
     count: int
+    drawn: np.ndarray
+    """Interquartile means of bootstrap samples; empty for few seeds."""
 
 
 def iqm(scores: np.ndarray) -> np.ndarray:
@@ -60,14 +62,23 @@ def iqm(scores: np.ndarray) -> np.ndarray:
     return ordered[..., cut : count - cut].mean(axis=-1)
 
 
-def result(scores: np.ndarray) -> Result:
+def result(scores: np.ndarray, generator: np.random.Generator) -> Result:
     """Summarises the scores of the seeds."""
     count = len(scores)
     if count < SEEDS_MIN:
-        return Result(scores.mean(), scores.min(), scores.max(), count)
-    drawn = np.random.default_rng(0).choice(scores, (SAMPLES, count))
-    low, high = np.quantile(iqm(drawn), (0.025, 0.975))
-    return Result(float(iqm(scores)), float(low), float(high), count)
+        return Result(scores.mean(), scores.min(), scores.max(), count, np.empty(0))
+    return bootstrap(float(iqm(scores)), iqm(generator.choice(scores, (SAMPLES, count))), count)
+
+
+def bootstrap(middle: float, drawn: np.ndarray, count: int) -> Result:
+    """Returns a result with the interval of bootstrap samples."""
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return Result(middle, float(low), float(high), count, drawn)
+
+
+def difference(ours: Result, before: Result) -> Result:
+    """Returns the difference of two results that have bootstrap samples."""
+    return bootstrap(ours.middle - before.middle, ours.drawn - before.drawn, ours.count)
 
 
 def results(path: Path) -> dict[str, dict[str, Result]]:
@@ -75,6 +86,7 @@ def results(path: Path) -> dict[str, dict[str, Result]]:
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     found: dict[str, dict[str, Result]] = {}
+    generator = np.random.default_rng(0)
     for task, title in TASKS.items():
         key = "success_rate" if title.endswith("success") else "return_mean"
         for method in METHODS:
@@ -84,7 +96,7 @@ def results(path: Path) -> dict[str, dict[str, Result]]:
                 if row["task"] == task and row["method"].removesuffix("-her") == method
             ]
             if own:
-                found.setdefault(task, {})[method] = result(np.array(own))
+                found.setdefault(task, {})[method] = result(np.array(own), generator)
     return found
 
 
@@ -106,13 +118,17 @@ def cell(result: Result, is_success: bool) -> str:
 def table(found: dict[str, dict[str, Result]]) -> Iterator[str]:
     """Yields the table's lines."""
     present = [method for method in METHODS if any(method in methods for methods in found.values())]
-    yield f"| Task | {' | '.join(METHODS[method] for method in present)} |"
-    yield "|---" * (len(present) + 1) + "|"
+    heads = ["Task", *(METHODS[method] for method in present), "Ours less before"]
+    yield f"| {' | '.join(heads)} |"
+    yield "|---" * len(heads) + "|"
     for task, methods in found.items():
         is_success = TASKS[task].endswith("success")
         cells = [
             cell(methods[method], is_success) if method in methods else "" for method in present
         ]
+        ours, before = methods["ours"], methods["before"]
+        both = difference(ours, before) if ours.drawn.size and before.drawn.size else None
+        cells.append("" if both is None else cell(both, is_success))
         yield f"| {TASKS[task]} | {' | '.join(cells)} |"
 
 
