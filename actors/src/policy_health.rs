@@ -49,8 +49,8 @@ fn bounds_message(row: &EvaluationRow) -> String {
     format!(
         "warning: {:.0} % of the policy's actions were at their bounds in two evaluations in a \
          row; such a policy hardly learns. If the return is poor, start again with \
-         --set exploration.warm_up_range=1 and more exploration.warm_up_steps, or a smaller \
-         algorithm.actor_learning_rate",
+         --set algorithm.saturation_penalty=0.003, with --set exploration.warm_up_range=1 and \
+         more exploration.warm_up_steps, or with a smaller algorithm.actor_learning_rate",
         100.0 * row.at_bounds.unwrap_or_default()
     )
 }
