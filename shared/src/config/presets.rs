@@ -192,7 +192,8 @@ pub fn suitable_preset(task: &str) -> &'static str {
     if is_sparse_goal { "goal" } else { PRESETS[0].name }
 }
 
-/// Returns the values that a kind of policy changes, which are merged over those of the task.
+/// Returns the values that a kind of policy changes, which are merged over task and preset. The
+/// user's values override them.
 ///
 /// `mlp` decides at every step, so two updates per decision would be five times as many per step as
 /// for `dmp`. The paper's baselines do one update per step.
@@ -203,8 +204,8 @@ pub fn suitable_preset(task: &str) -> &'static str {
 pub fn policy_defaults(kind: PolicyKind) -> Option<Table> {
     match kind {
         PolicyKind::Dmp | PolicyKind::Chunk => None,
-        // No preset sets the target entropy. A policy that decides at every step has more updates,
-        // so the published step size of the temperature is fast enough.
+        // A policy that decides at every step has more updates, so the published step size of the
+        // temperature is fast enough.
         PolicyKind::Mlp => {
             let text = "[pacing]\nupdates_per_segment = 1.0\n\
                         [algorithm]\naction_rate_penalty = 0.0\n\

@@ -44,26 +44,18 @@ pub(super) struct Sources<'a> {
 
 /// Merges the sources. Every mistake in them is a usage error.
 ///
-/// Policy and algorithm are known only after merging. The policy's own defaults override the
-/// task's, and the algorithm's override the preset: if there are any, the sources are merged once
-/// more with them.
+/// Policy and algorithm are known only after merging. Their own defaults override the preset: if
+/// there are any, the sources are merged once more with them.
 pub(super) fn merge(sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
-    let config = merge_with(&Own::default(), sources)?;
-    let own = Own {
-        policy: policy_defaults(config.policy.kind),
-        algorithm: algorithm_defaults(config.algorithm.name),
-    };
-    match own {
-        Own { policy: None, algorithm: None } => Ok(config),
-        own => merge_with(&own, sources),
-    }
-}
-
-/// Defaults of the policy and of the algorithm.
-#[derive(Debug, Default)]
-struct Own {
-    policy: Option<Table>,
-    algorithm: Option<Table>,
+    let config = merge_with(&[], sources)?;
+    let own: Vec<_> = [
+        policy_defaults(config.policy.kind).map(|table| ("policy defaults", table)),
+        algorithm_defaults(config.algorithm.name).map(|table| ("algorithm defaults", table)),
+    ]
+    .into_iter()
+    .flatten()
+    .collect();
+    if own.is_empty() { Ok(config) } else { merge_with(&own, sources) }
 }
 
 /// Adds the pairs of `--env-kwargs`.
@@ -78,17 +70,18 @@ pub(super) fn add_env_kwargs(layers: &mut Layers, pairs: &[String]) -> anyhow::R
     Ok(())
 }
 
-fn merge_with(own: &Own, sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
+fn merge_with(own: &[(&str, Table)], sources: &Sources<'_>) -> anyhow::Result<ExperimentConfig> {
     let mut layers = Layers::new();
     add(&mut layers, sources.task, task_table(sources.task)?)?;
-    add(&mut layers, "policy defaults", own.policy.clone().unwrap_or_default())?;
     let preset = PRESETS.iter().find(|preset| preset.name == sources.preset);
     let preset = preset.with_context(|| format!("no preset {}", sources.preset))?;
     add(&mut layers, preset.name, preset.table())?;
     if let Some(task) = task_defaults(sources.task) {
         add(&mut layers, preset.name, task.over_preset(preset.name))?;
     }
-    add(&mut layers, "algorithm defaults", own.algorithm.clone().unwrap_or_default())?;
+    for (origin, table) in own {
+        add(&mut layers, origin, table.clone())?;
+    }
     if let Some(file) = sources.file {
         add(&mut layers, &file.display().to_string(), read_table(file)?)?;
     }
@@ -402,5 +395,9 @@ mod tests {
         let user_set = Sources { set: &both, ..sources("reacher") };
         assert_eq!(merge(&user_set).unwrap().pacing.updates_per_segment, 3.0);
         assert_eq!(merge(&sources("reacher")).unwrap().pacing.updates_per_segment, 2.0);
+        for preset in PRESETS.iter().map(|preset| preset.name) {
+            let mlp = Sources { set: &kind, preset, ..sources("panda-push") };
+            assert_eq!(merge(&mlp).unwrap().pacing.updates_per_segment, 1.0, "{preset}");
+        }
     }
 }
